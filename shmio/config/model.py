@@ -106,6 +106,7 @@ class Emulator(Section):
     parameters: dict[str, Any] = {}
     folder: Text = "."
     clock: EmulatorClockName = "wall"
+    profile: Text | None = None
     faults: bool = False
     block: Text | None = None
     type_bytes: TypeBytes = {}

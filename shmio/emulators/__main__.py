@@ -134,7 +134,15 @@ def _started(worker: Worker, listen: Address, cleanup: ExitStack) -> Device:
     code = UserCode(config["folder"], config["parameters"])
     if config["kind"] == S7 and not is_user_code(config["program"]):
         skip_package_code("snap7")  # else it imports asyncio and more, which takes a third of the time of the start
-    device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"], code=code)
+    device = create(
+        config["kind"],
+        served,
+        config["program"],
+        listen,
+        db_number=config["dbNumber"],
+        profile=config["profile"],
+        code=code,
+    )
     cleanup.callback(device.stop)
     _beating(worker, device.start)
     return device

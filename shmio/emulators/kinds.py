@@ -27,6 +27,7 @@ def create(
     listen: Address,
     *,
     db_number: int | None = None,
+    profile: str | None = None,
     code: UserCode = BUILT_IN,
 ) -> Device:
     """Create an emulator without starting it.
@@ -37,18 +38,26 @@ def create(
         program: The program to run.
         listen: The address to listen on.
         db_number: For S7, the number of the first layout's block; None: the number in the layout.
+        profile: For S7, the name of the kind of CPU whose times and limits the emulator has.
         code: Folder and parameters of the program if it is a class of the user.
 
     Raises:
-        ConfigError: The library is missing, there is no such program, or a layout does not suit it.
+        ConfigError: The library is missing, there is no such profile or program, or a layout does
+            not suit it.
 
     """
     # Each kind is imported where it is used, because a process has only one.
     if kind == S7:
         from shmio.emulators.emulator import Emulator  # noqa: PLC0415
+        from shmio.emulators.s7 import ServerOptions  # noqa: PLC0415
 
         layouts = [one.layout for one in served]
-        return Emulator(layouts[0], program, listen, db_number=db_number, others=layouts[1:], code=code)
+        options = None if profile is None else ServerOptions.of(profile)
+        return Emulator(
+            layouts[0], program, listen, db_number=db_number, others=layouts[1:], options=options, code=code
+        )
+    if profile is not None:
+        raise ConfigError(f"profile: only emulators of kind {S7} have profiles; leave out this key")
     if importlib.util.find_spec(_LIBRARIES[kind]) is None:
         raise ConfigError(_EXTRA.format(kind=kind))
     if kind == "modbus":

@@ -1,8 +1,11 @@
 """An S7 server for emulated controllers, based on python-snap7's server.
 
-python-snap7 3.3 provides the memory areas, the ISO-on-TCP handshake, system status lists, block
-lists, the clock, and the start and stop of the emulated CPU. This module adds the status list with
-the operating mode, cuts answers that do not fit a PDU into parts, and replaces:
+python-snap7 3.3 provides the memory areas, system status lists, block lists, the clock, and the
+start and stop of the emulated CPU. This module adds the status list with the operating mode, cuts
+answers that do not fit a PDU into parts, and replaces:
+
+- the connection, which joins requests that come in several TPDUs, skips empty ones (Siemens' own
+  clients send one after nearly every answer), and can send answers as late as a real CPU;
 
 - the status lists that describe the CPU, which lack the head of the records in python-snap7, and the
   information about blocks, which lacks the checksum there;
@@ -18,10 +21,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import select
 import socket
 import struct
 import threading
+import time
 import zlib
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -29,12 +35,13 @@ from typing import Any, NamedTuple, Self
 
 from snap7.datatypes import S7Area, S7WordLen
 from snap7.s7protocol import S7Function, S7PDUType
-from snap7.server import CPUState, Server, ServerISOConnection, ServerState
+from snap7.server import CPUState, Server, ServerState
 from snap7.type import SrvArea
 
 from shmio.config.address import Address
+from shmio.emulators.s7_profiles import PROFILES, Delays, Kind, Profile
 from shmio.errors import ConfigError, EndpointError, ShmioError
-from shmio.wording import cannot_listen
+from shmio.wording import cannot_listen, unknown
 
 MAX_JOBS = 32
 MAX_PDU_SIZE = 960
@@ -70,14 +77,21 @@ _PERIPHERAL = 0x80
 _AREAS = {int(area): area for area in S7Area} | {_PERIPHERAL: S7Area.PE}  # peripheral access reaches only inputs
 _NUMBERED = {S7Area.CT: S7WordLen.COUNTER, S7Area.TM: S7WordLen.TIMER}
 """Areas that are addressed by number, with the type that they need."""
+_READ_ONLY = frozenset(_NUMBERED.values())
+"""Types of items that real CPUs do not let clients write."""
 
 _TPKT = struct.Struct(">BxH")
-_DT = b"\x02\xf0\x80"  # COTP data, and the end of the message: PDUs fit a TPDU, so clients have no reason to split them
+_DT = b"\x02\xf0\x80"  # COTP data, and the end of the message
+_EOT = 0x80
+_CONNECT, _CONFIRM = 0xE0, 0xD0  # COTP TPDUs that open a connection
+_TPDU_SIZE, _CALLING_TSAP, _CALLED_TSAP = 0xC0, 0xC1, 0xC2  # their parameters, in the order of real CPUs
+_TPDU_CODE = 0x0A  # 1024 bytes, which real CPUs confirm; clients may ask for less
 _FRAME_OVERHEAD = 7
 _LONGEST_FRAME = MAX_PDU_SIZE + _FRAME_OVERHEAD
 _INBOX_SIZE = 8 * _LONGEST_FRAME
 _ANSWERS_AT_ONCE = 8  # maximum number of answers sent together, even if more requests are waiting
 _SEND_TIMEOUT_S = 5
+_CONNECT_TIMEOUT_S = 5
 _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
 """Socket options, in s: a client whose host is down is disconnected within a minute."""
 _SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # the first starts the CPU; the others need no action
@@ -101,6 +115,10 @@ _BLOCK_HEAD = 36
 _USERDATA_DATA = 22
 """Offset of the data in an answer to userdata, and in a request for the next part of one."""
 _NEXT_PART = 0x12
+_SENT_TO_CPU = 4  # high half of the byte with the group in requests; 0: a push, 8: an answer
+_NO_LIST, _NO_BLOCK, _NO_SERVICE = 0xD402, 0xD209, 0x8104
+_REFUSALS = {(4, 1): _NO_LIST, (3, 3): _NO_BLOCK}
+"""Errors by which a CPU refuses requests by userdata, by group and function; others: ``_NO_SERVICE``."""
 _EMPTY_PARAMETERS = bytes.fromhex("000112 08 12 84 01 00 00 00 0000")
 _IS_IT_RUNNING = bytes((0, 1, 0, 0, _READ))
 """Sizes and parameters of a read without items, which ``get_cpu_state()`` of python-snap7 3 sends.
@@ -133,12 +151,27 @@ class ServerOptions:
     max_jobs: int = 8
     """Maximum number of jobs in flight that the server grants."""
     fault: Fault | None = None
+    profile: Profile | None = None
+    """How long the answers take; None: they are sent at once."""
     block_size: int | None = None
     """Number of bytes of a data block that clients see at most, as if it were an older, shorter one; None: all."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
             raise ValueError(f"a PDU has 100 to {MAX_PDU_SIZE} bytes, and 1 to {MAX_JOBS} jobs are granted: {self}")
+
+    @classmethod
+    def of(cls, profile: str) -> ServerOptions:
+        """Return the options of a kind of CPU.
+
+        Raises:
+            ConfigError: There is no profile with this name.
+
+        """
+        found = PROFILES.get(profile)
+        if found is None:
+            raise ConfigError(f"profile: {unknown('profile', profile, PROFILES)}")
+        return cls(found.pdu_size, found.jobs, profile=found)
 
 
 class _MalformedJobError(Exception):
@@ -178,10 +211,17 @@ class Jobs:
     fit the PDU, fails with a header error.
     """
 
-    def __init__(self, memory: Memory, options: ServerOptions) -> None:
+    def __init__(self, memory: Memory, options: ServerOptions, longest: int = MAX_PDU_SIZE) -> None:
+        """Begin with a client whose TPDUs hold at most ``longest`` bytes of a PDU."""
         self._memory = memory
         self._options = options
+        self._most = min(longest, options.max_pdu_size)
         self.pdu_size = 0  # before the set-up, every job is too large
+
+    @property
+    def longest(self) -> int:
+        """Size in bytes of the largest PDU for this client, also before the set-up."""
+        return self.pdu_size or self._most
 
     def answer(self, pdu: memoryview) -> bytes | None:
         """Answer one S7 PDU of ten or more bytes; return None if it is not a known job."""
@@ -210,9 +250,9 @@ class Jobs:
         if len(parameters) != 8:
             raise _MalformedJobError
         calling, called, pdu_size = struct.unpack_from(">HHH", parameters, 2)
-        self.pdu_size = min(pdu_size, self._options.max_pdu_size)
-        jobs = self._options.max_jobs
-        granted = struct.pack(">BxHHH", _SETUP, min(calling, jobs), min(called, jobs), self.pdu_size)
+        self.pdu_size = min(pdu_size, self._most)
+        # Real CPUs return the number for the calling side as it is, and limit the other one.
+        granted = struct.pack(">BxHHH", _SETUP, calling, min(called, self._options.max_jobs), self.pdu_size)
         return _acknowledgement(reference, granted)
 
     def _read(self, reference: int, parameters: memoryview) -> bytes:
@@ -314,6 +354,8 @@ def _values(data: memoryview, count: int) -> list[memoryview]:
 def _write_item(item: _Item, value: memoryview) -> int:
     if item.code != _OK:
         return item.code
+    if item.type in _READ_ONLY:
+        return _DENIED
     if len(value) != item.size:
         return _TYPE_MISMATCH
     if item.type == _BIT:
@@ -364,6 +406,138 @@ class _Parts:
         return bytes(head) + _ITEM_HEAD.pack(code, 0x09 if data else 0, len(data)) + data
 
 
+# -- connections -------------------------------------------------------------------------------------------------------
+
+
+class ViolationError(Exception):
+    """The client breaks the protocol; the connection ends."""
+
+
+class Inbox:
+    """What a client sends, in a buffer of fixed size, as frames or as whole PDUs."""
+
+    def __init__(self, client: socket.socket) -> None:
+        self._client = client
+        self._data = memoryview(bytearray(_INBOX_SIZE))
+        self._start = self._end = 0
+        self._parts = bytearray()  # of a PDU whose last TPDU has not come yet
+
+    def receive(self) -> bool:
+        """Wait for data. Return False if the client has left. Take all complete frames before."""
+        left = self._end - self._start
+        if self._start and left:
+            self._data[:left] = self._data[self._start : self._end]
+        self._start, self._end = 0, left
+        received = self._client.recv_into(self._data[left:])
+        self._end += received
+        return received > 0
+
+    def frame(self) -> memoryview | None:
+        """Return the next frame, valid until the next ``receive``; None if it is not complete."""
+        left = self._end - self._start
+        if left < _FRAME_OVERHEAD:
+            return None
+        version, length = _TPKT.unpack_from(self._data, self._start)
+        if version != 3 or not _FRAME_OVERHEAD <= length <= _LONGEST_FRAME:
+            raise ViolationError
+        if left < length:
+            return None
+        frame = self._data[self._start : self._start + length]
+        self._start += length
+        return frame
+
+    def pdu(self) -> memoryview | None:
+        """Return the next PDU, joined from its TPDUs, as :meth:`frame` does; skip empty TPDUs."""
+        while (frame := self.frame()) is not None:
+            if frame[4:6] != _DT[:2]:
+                raise ViolationError
+            pdu = frame[_FRAME_OVERHEAD:]
+            if self._parts or not frame[6] & _EOT:
+                self._parts += pdu
+                if len(self._parts) > MAX_PDU_SIZE:
+                    raise ViolationError
+                if not frame[6] & _EOT:
+                    continue
+                pdu = memoryview(bytes(self._parts))
+                self._parts.clear()
+            if pdu:
+                return pdu
+        return None
+
+
+class _Outbox:
+    """The answers to a client: sent together at once or, with a profile, each when it is due."""
+
+    def __init__(self, client: socket.socket, delays: Delays | None, stopping: threading.Event) -> None:
+        self._client = client
+        self._delays = delays
+        self._stopping = stopping
+        self._waiting: deque[tuple[int, bytes]] = deque()
+
+    def put(self, kind: Kind, frame: bytes) -> None:
+        """Add an answer."""
+        due_ns = 0 if self._delays is None else self._delays.due_ns(kind, time.monotonic_ns())
+        self._waiting.append((due_ns, frame))
+        if self._delays is None and len(self._waiting) >= _ANSWERS_AT_ONCE:
+            self.send()
+
+    def send(self) -> None:
+        """Send the answers that are due."""
+        waiting = self._waiting
+        if self._delays is None:
+            if waiting:
+                self._client.sendall(b"".join(frame for _, frame in waiting))
+                waiting.clear()
+            return
+        while waiting and waiting[0][0] <= time.monotonic_ns():
+            self._client.sendall(waiting.popleft()[1])
+
+    def wait(self) -> bool:
+        """Wait until the client sends, or an answer is due. Return whether there may be something to receive.
+
+        If many answers wait, receive nothing more before the next one is sent.
+        """
+        if not self._waiting:
+            return True
+        full = len(self._waiting) >= MAX_JOBS
+        ready, _, _ = select.select(() if full else (self._client,), (), (), self._left_s())
+        return bool(ready)
+
+    def finish(self) -> None:
+        """Send what still waits when it is due: the client sends no more. The end of the server ends this."""
+        while self._waiting and not self._stopping.wait(self._left_s()):
+            self.send()
+
+    def _left_s(self) -> float:
+        return max(0, self._waiting[0][0] - time.monotonic_ns()) / 1e9
+
+
+def _confirmed(request: memoryview) -> tuple[bytes, int]:
+    """Return the frame that confirms a connection, and the number of bytes of a PDU that fit into a TPDU."""
+    if request[5] & 0xF0 != _CONNECT or len(request) < 11:
+        raise ViolationError
+    given: dict[int, bytes] = {}
+    at = 11
+    while at + 2 <= len(request):
+        end = at + 2 + request[at + 1]
+        given[request[at]] = bytes(request[at + 2 : end])
+        at = end
+    asked = given.get(_TPDU_SIZE, b"")
+    code = min(asked[0], _TPDU_CODE) if len(asked) == 1 and asked[0] >= 7 else _TPDU_CODE
+    given[_TPDU_SIZE] = bytes((code,))
+    parameters = b"".join(
+        bytes((key, len(given[key]))) + given[key] for key in (_TPDU_SIZE, _CALLING_TSAP, _CALLED_TSAP) if key in given
+    )
+    head = struct.pack(">BB2sHB", 6 + len(parameters), _CONFIRM, bytes(request[8:10]), 1, 0)
+    frame = _TPKT.pack(3, 4 + len(head) + len(parameters)) + head + parameters
+    return frame, (1 << code) - 3
+
+
+def _kind_of(pdu: memoryview) -> Kind:
+    kinds: dict[int, Kind] = {_READ: "read", _WRITE: "write", _SETUP: "setup"}
+    return kinds.get(pdu[10], "other") if pdu[1] == _JOB and len(pdu) > 10 else "other"
+
+
 # -- the server --------------------------------------------------------------------------------------------------------
 
 
@@ -383,6 +557,7 @@ class S7Server(Server):
         self._client_sockets: set[socket.socket] = set()
         self._stopping = threading.Event()
         self._checksums: dict[int, int] = {}
+        self._accepted = 0  # number of clients so far
 
     def add_block(self, number: int, data: bytearray) -> None:
         """Serve ``data`` itself, not a copy, as data block ``number``.
@@ -552,52 +727,61 @@ class S7Server(Server):
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE.items():
             client.setsockopt(socket.IPPROTO_TCP, option, value)
-        if not ServerISOConnection(client).accept_connection():  # has its own time-out
-            return
+        inbox = Inbox(client)
+        with self.client_lock:
+            self._accepted += 1
+            seed = self._accepted
+        delays = None if self._options.profile is None else Delays(self._options.profile, seed)
+        outbox = _Outbox(client, delays, self._stopping)
+        with contextlib.suppress(ViolationError):
+            self._answer(inbox, outbox, address, self._connect(client, inbox, outbox))
+
+    @staticmethod
+    def _connect(client: socket.socket, inbox: Inbox, outbox: _Outbox) -> int:
+        """Open the ISO-on-TCP connection in time; return the number of bytes of a PDU that fit into a TPDU."""
+        deadline = time.monotonic() + _CONNECT_TIMEOUT_S
+        while (request := inbox.frame()) is None:
+            client.settimeout(max(0.001, deadline - time.monotonic()))
+            if not inbox.receive() or time.monotonic() > deadline:
+                raise ViolationError
+        confirm, longest = _confirmed(request)
         client.setblocking(True)  # only sends time out, so a silent client may stay
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _SEND_TIMEOUT_S, 0))
-        jobs, parts = Jobs(self._memory, self._options), _Parts()
-        inbox = memoryview(bytearray(_INBOX_SIZE))
-        end = 0
-        while received := client.recv_into(inbox[end:]):
-            end += received
-            start = 0
-            answers: list[bytes] = []
-            while end - start >= _FRAME_OVERHEAD:
-                version, length = _TPKT.unpack_from(inbox, start)
-                if version != 3 or not _FRAME_OVERHEAD + 10 <= length <= _LONGEST_FRAME:
-                    return
-                if end - start < length:
-                    break
-                frame = inbox[start : start + length]
-                if frame[4:7] != _DT:
-                    return
-                answer = jobs.answer(frame[7:]) or self._process_in_parts(bytes(frame[7:]), address, jobs, parts)
-                if answer is None:
-                    return
-                answers += (_TPKT.pack(3, len(answer) + _FRAME_OVERHEAD), _DT, answer)
-                start += length
-                if len(answers) >= 3 * _ANSWERS_AT_ONCE:
-                    client.sendall(b"".join(answers))
-                    answers.clear()
-            if answers:
-                client.sendall(b"".join(answers))
-            left = end - start
-            if start and left:
-                inbox[:left] = inbox[start:end]
-            end = left
+        outbox.put("confirm", confirm)
+        return longest
 
-    def _process_in_parts(self, request: bytes, address: tuple[str, int], jobs: Jobs, parts: _Parts) -> bytes | None:
-        size = jobs.pdu_size or MAX_PDU_SIZE
+    def _answer(self, inbox: Inbox, outbox: _Outbox, address: tuple[str, int], longest: int) -> None:
+        jobs, parts = Jobs(self._memory, self._options, longest), _Parts()
+        while True:
+            while (pdu := inbox.pdu()) is not None:
+                if len(pdu) < _JOB_HEAD.size:
+                    raise ViolationError
+                answer = jobs.answer(pdu)
+                if answer is None:
+                    answer = self._process_in_parts(bytes(pdu), address, jobs, parts)
+                if answer:
+                    outbox.put(_kind_of(pdu), _TPKT.pack(3, len(answer) + _FRAME_OVERHEAD) + _DT + answer)
+            outbox.send()
+            if outbox.wait() and not inbox.receive():
+                break
+        outbox.finish()
+
+    def _process_in_parts(self, request: bytes, address: tuple[str, int], jobs: Jobs, parts: _Parts) -> bytes:
+        """Answer what is no job to read, to write or to set up; return no bytes if no answer is due.
+
+        Raises:
+            ViolationError: The client does not speak S7.
+
+        """
+        size = jobs.longest
+        if _needs_no_answer(request):
+            return b""
         part = parts.requested(request, size)
         if part is not None:
             return part
         answer = self._process_request(request, address)
         if answer is None:
-            return None
-        if min(len(request) - 16, len(answer) - _USERDATA_DATA) > 0 and answer[1] == S7PDUType.USERDATA:
-            # python-snap7 refuses each request as if it were "read SZL"
-            answer = answer[:15] + bytes((0x80 | request[15] & 0x0F, request[16])) + answer[17:]
+            raise ViolationError
         return parts.cut(request, answer, size)
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
@@ -638,14 +822,26 @@ class S7Server(Server):
         number = int(digits) if digits.isdigit() else 0
         area = self.memory_areas.get((S7Area.DB, number))
         if bytes(asked[:2]) != b"0A" or area is None or self._options.fault is Fault.OPTIMIZED:
-            error: bytes = self._build_userdata_error_response(request, _NO_SUCH_OBJECT << 8)
-            return error
+            return self._build_userdata_error_response(request, 0)
         size = self._memory.size_of(area, self._options)
         checksum = self._checksums.get(number, 0)
         head = struct.pack(">2s9sBHI16x", b"0A", b"", 0x0A, number, size + _BLOCK_HEAD)
         info = head + struct.pack(">6xH8s8s8sBxH8x", size & 0xFFFF, b"shmio", b"", b"", 1, checksum)
         answer: bytes = self._build_userdata_success_response(request, userdata_params, info)
         return answer
+
+    def _build_userdata_error_response(self, request: dict[str, Any], error_code: int) -> bytes:  # noqa: ARG002
+        """Refuse a request as a CPU does: with an error in the parameters, and without data."""
+        raw = request.get("raw_parameters", b"").ljust(8, b"\0")
+        group, function, sequence = raw[5] & 0x0F, raw[6], raw[7]
+        parameters = struct.pack(
+            ">3s5BxxH", b"\0\1\x12", 8, 0x12, 0x80 | group, function, sequence,
+            _REFUSALS.get((group, function), _NO_SERVICE),
+        )  # fmt: skip
+        head = _JOB_HEAD.pack(
+            _PROTOCOL, S7PDUType.USERDATA, request.get("sequence", 0), len(parameters), _ITEM_HEAD.size
+        )
+        return head + parameters + _ITEM_HEAD.pack(_NO_SUCH_OBJECT, 0, 0)
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
         """Return a system status list with its head, as in the manual of S7-300/400.
@@ -665,6 +861,13 @@ class S7Server(Server):
             found: bytes | None = super()._get_szl_data(szl_id, szl_index)
             return found
         return struct.pack(">HH", len(records[0]), len(records)) + b"".join(records)
+
+
+def _needs_no_answer(pdu: bytes) -> bool:
+    """Return whether a PDU only acknowledges or informs: an Ack, or userdata that is no request."""
+    if pdu[1] == S7PDUType.USERDATA:
+        return len(pdu) > 15 and pdu[0] == _PROTOCOL and pdu[15] >> 4 != _SENT_TO_CPU
+    return pdu[0] == _PROTOCOL and pdu[1] in {S7PDUType.ACK, S7PDUType.ACK_DATA}
 
 
 def _is_served(job: bytes) -> bool:

@@ -286,7 +286,8 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config
     if emulator.faults and emulator.kind not in FAULTY:
         raise ConfigError(f"{key}.faults: only emulators of kind {' or '.join(FAULTY)} can have faults")
     try:
-        create(emulator.kind, served, program, Address("", 0), db_number=emulator.dbNumber)
+        listen, profile = Address("", 0), emulator.profile
+        create(emulator.kind, served, program, listen, db_number=emulator.dbNumber, profile=profile)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
     return tuple(served)

@@ -32,6 +32,8 @@ from shmio.connectors.ros import messages as ros
 from shmio.connectors.ros.addresses import FieldError
 from shmio.connectors.ros.values import ValueConverter
 from shmio.connectors.s7 import pdu, userdata
+from shmio.connectors.s7.transport import Inbox
+from shmio.emulators import s7 as emulator
 from shmio.emulators.s7 import Jobs, Memory, ServerOptions
 from shmio.endpoints.web.uploads import describe
 from shmio.errors import ConnectorError, RecordingError, SnapshotError, ValueRangeError
@@ -49,7 +51,10 @@ from tests.fuzz.layout_inputs import Mutator
 from tests.fuzz.page_calls import calls, check_call
 from tests.unit.connectors.mqtt import test_fuzz as mqtt
 from tests.unit.connectors.opcua import test_decode as opcua
+from tests.unit.connectors.s7 import test_traffic as s7_answers
+from tests.unit.connectors.s7.noise import EMPTY, parts_of
 from tests.unit.emulators import test_s7_jobs as s7_jobs
+from tests.unit.emulators import test_s7_traffic as s7_requests
 from tests.unit.layout.importing import test_importer as importers
 from tests.unit.recording.reading.test_reader import look
 
@@ -147,6 +152,40 @@ def _check_s7_answer(data: bytes) -> None:
             userdata.szl_records(part.data, 0x11)
             userdata.parse_clock(part.data)
             userdata.parse_block(part.data, 1)
+
+
+def _s7_streams() -> list[bytes]:
+    answers = [pdu.data_frame(frame[4:]) for frame in _s7_frames()[:4]]
+    streams = [b"".join(map(add, answers)) for add in s7_answers.ADDED.values()]
+    return [*streams, s7_requests.SETUP + EMPTY + s7_requests.READ_OF_EIGHT, parts_of(answers[0], 3, 9)]
+
+
+class _Sender:
+    """A client that sends given bytes, in pieces, and then leaves."""
+
+    def __init__(self, data: bytes) -> None:
+        self._left = data
+
+    def recv_into(self, room: memoryview) -> int:
+        count = min(len(room), len(self._left), 97)
+        room[:count], self._left = self._left[:count], self._left[count:]
+        return count
+
+
+def _check_s7_stream(data: bytes) -> None:
+    """Receive a stream in pieces, as the connector and the emulator do."""
+    answers, sender = Inbox(2, 300), _Sender(data)
+    with suppress(ConnectorError):
+        while received := sender.recv_into(answers.room()):
+            answers.add(received)
+            while (frame := answers.frame()) is not None:
+                assert pdu.FRAME_OVERHEAD <= len(frame) <= 300
+                assert int.from_bytes(frame[2:4], "big") == len(frame)
+    requests = emulator.Inbox(_Sender(data))  # type: ignore[arg-type]  # it only receives
+    with suppress(emulator.ViolationError):
+        while requests.receive():
+            while (request := requests.pdu()) is not None:
+                assert 0 < len(request) <= emulator.MAX_PDU_SIZE
 
 
 def _check_s7_job(data: bytes) -> None:
@@ -404,6 +443,7 @@ def _recordings() -> list[bytes]:
 PARSERS: dict[str, Parser] = {
     "layout": Parser(lambda seed: iter(Mutator(seed)), check_layout, 3.0),
     "s7-answer": Parser(damaged(_s7_frames), _check_s7_answer),
+    "s7-stream": Parser(damaged(_s7_streams), _check_s7_stream),
     "s7-job": Parser(damaged(lambda: [bytes(one) for one in s7_jobs.VALID]), _check_s7_job),
     "modbus": Parser(damaged(lambda: [_MODBUS, b"TT\0\0\0\3\1\x83\2"]), _check_modbus),
     "opcua": Parser(damaged(_opcua_messages), _check_opcua),

@@ -28,7 +28,7 @@ READ_REQUEST_SIZE = 31
 REFERENCE_OFFSET = 11  # offset of the PDU reference in a frame
 MAX_BLOCK_SIZE = 65536  # size of a standard data block; also the number of references, if each read has one byte
 
-WANTED_JOBS = 24  # enough for four reads of a 2 kB block; real controllers grant 1 to 16
+WANTED_JOBS = 8  # docs/decisions/0049: the most that widespread clients ask for; real controllers grant 1 to 4
 WANTED_PDU_SIZE = 960
 MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; a peer that grants less than 64 is not a controller
 DEFAULT_TPDU_SIZE = 65531  # if the peer does not name a size: RFC 1006
@@ -44,6 +44,9 @@ _USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
 HEADER_END = 19  # end of the headers of an answer to a job; its parameters follow
 USERDATA_END = 17  # the same for userdata, whose header has no error code
 _ITEM_END = 25
+_VERSION = 3
+_PROTOCOL = 0x32
+_EOT = 0x80  # marks the last TPDU of a message
 _COTP_DATA = b"\x02\xf0\x80"  # header length, DT, end of the message
 _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
 _ACK, _ACK_DATA = 2, 3
@@ -86,17 +89,51 @@ def frame_length(inbox: memoryview, start: int, longest: int) -> int:
 
     """
     version, length = _TPKT.unpack_from(inbox, start)
-    if version != 3:
-        sent = bytes(inbox[start : start + 8])
-        raise ConnectorError(f"the peer is not an S7 controller: it sent {sent!r}, which is not ISO-on-TCP")
+    if version != _VERSION:
+        check_first(inbox, start)
     if not FRAME_OVERHEAD <= length <= longest:
         raise ConnectorError(f"the controller sent a frame of {length} bytes, expected {FRAME_OVERHEAD} to {longest}")
     return int(length)
 
 
+def check_first(inbox: memoryview, start: int) -> None:
+    """Raise ConnectorError unless the byte at ``start`` can begin a frame."""
+    if inbox[start] != _VERSION:
+        sent = bytes(inbox[start : start + 8])
+        raise ConnectorError(f"the peer is not an S7 controller: it sent {sent!r}, which is not ISO-on-TCP")
+
+
+def is_data(frame: memoryview) -> bool:
+    """Return whether a frame holds a data TPDU of class 0."""
+    return frame[4] == 2 and frame[5] == _COTP_DT
+
+
+def is_last(frame: memoryview) -> bool:
+    """Return whether a data TPDU is the last one of its message; the number beside the mark has no meaning."""
+    return frame[6] >= _EOT
+
+
+def is_whole(frame: memoryview) -> bool:
+    """Return whether a data TPDU is a whole message, which has data, in the usual form."""
+    return frame[6] == _EOT and len(frame) > FRAME_OVERHEAD
+
+
+def data_frame(message: bytes) -> bytes:
+    """Return a message as one frame."""
+    return _frame(_COTP_DATA + message)
+
+
+def is_push(frame: memoryview) -> bool:
+    """Return whether a frame is userdata that no request asked for, such as an alarm or cyclic data.
+
+    In their parameters, the high half of the byte with the group is 0; in requests it is 4, in answers 8.
+    """
+    return len(frame) > 22 and frame[8] == USERDATA and frame[7] == _PROTOCOL and is_data(frame) and frame[22] < 0x10
+
+
 def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = JOB) -> bytes:
     """Return a request as a frame; ``reference`` has 16 bits."""
-    header = _REQUEST.pack(0x32, rosctr, 0, reference, len(parameters), len(data))
+    header = _REQUEST.pack(_PROTOCOL, rosctr, 0, reference, len(parameters), len(data))
     return _frame(_COTP_DATA + header + parameters + data)
 
 
@@ -131,10 +168,9 @@ def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     cotp, protocol, kind, parameter_length, data_length = _HEADER.unpack_from(frame)
     if cotp != _COTP_DATA:
         _check_cotp(frame)
-        # The agreed TPDU size is large enough for any answer.
-        raise ConnectorError("the controller sent an answer in several TPDUs, although it fits into one")
-    if protocol != 0x32:
-        raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x32)")
+        raise ConnectorError(f"the controller sent a data TPDU with the header {cotp.hex(' ')}, expected 02 f0 80")
+    if protocol != _PROTOCOL:
+        raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x{_PROTOCOL:02X})")
     return kind, parameter_length, data_length
 
 

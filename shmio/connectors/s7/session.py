@@ -68,7 +68,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
     """For a tag table: patterns of registers to read only in every n-th cycle, each with its n."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
-    """Maximum number of requests in flight; the controller may grant fewer."""
+    """Maximum number of requests in flight, for which shmio asks (None: 8); the controller may grant fewer."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
@@ -178,7 +178,7 @@ class S7Session(ABC):
     def jobs(self) -> int:
         """Maximum number of requests in flight; 0 before the first session.
 
-        The controller grants this number; ``maxJobs`` may lower it.
+        The controller grants this number; it is at most ``maxJobs``.
         """
         return self._session.jobs
 
@@ -207,13 +207,11 @@ class S7Session(ABC):
             deadline_ns = transport.deadline_ns
             transport.send(pdu.connect_request(self.options.local_tsap, self.options.called_tsap), deadline_ns)
             tpdu_size = pdu.parse_connect_confirm(transport.next_frame(deadline_ns))
-            asked = pdu.Session(min(pdu.WANTED_PDU_SIZE, tpdu_size - 3), pdu.WANTED_JOBS)
+            asked = pdu.Session(min(pdu.WANTED_PDU_SIZE, tpdu_size - 3), self.options.maxJobs or pdu.WANTED_JOBS)
             reference = self._window.reference
             self._window.reference = (reference + 1) & 0xFFFF
             transport.send(pdu.setup_request(reference, asked.jobs, asked.pdu_size), deadline_ns)
             granted = pdu.parse_setup_answer(transport.next_frame(deadline_ns), reference, asked)
-            if transport.left:
-                raise ConnectorError("the controller sent unexpected bytes after the session was set up")
             self._use(granted, transport)
         self._begin(deadline_ns)
 
@@ -236,7 +234,7 @@ class S7Session(ABC):
             for query in other._queries:
                 other._finish(query, deadline_ns)
         transport, window = other._transport, other._window
-        if transport.left or not window.idle or window.waiting:
+        if not window.idle or window.waiting:
             return False
         other._transport = None
         self._transport = transport
@@ -373,10 +371,9 @@ class S7Session(ABC):
 
     def _use(self, granted: pdu.Session, transport: Transport) -> None:
         """Start to use a new session: create the requests and buffers for its reads."""
-        jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
-        self._session = pdu.Session(granted.pdu_size, jobs)
-        self._window = Window(jobs, self._window.reference)
-        transport.reserve(jobs, granted.pdu_size + pdu.FRAME_OVERHEAD)
+        self._session = granted
+        self._window = Window(granted.jobs, self._window.reference)
+        transport.inbox.reserve(granted.jobs, granted.pdu_size + pdu.FRAME_OVERHEAD)
         self._idle = self._reads()
 
     @abstractmethod
@@ -457,12 +454,10 @@ class S7Session(ABC):
         if not transport.receive(until_ns):
             return None
         answers = 0
-        while (frame := transport.frame()) is not None:
+        while (frame := transport.inbox.frame()) is not None:
             window.accept(frame)
             answers += 1
         self._answers += answers
-        if window.idle and transport.left:
-            raise ConnectorError("the controller sent unexpected bytes after the last answer")
         self._flush()
         return answers
 

@@ -1,5 +1,9 @@
 """The TCP connection to a controller, and the window of requests in flight on it.
 
+ISO 8073 (class 0) lets the peer divide a message into several data TPDUs, also empty ones; the last
+has the mark EOT. RFC 1006 puts each TPDU into a frame. Controllers send empty TPDUs before or after
+an answer. :meth:`Inbox.frame` joins the TPDUs of a message.
+
 Every wait has a deadline. Reads, writes and questions share the connection, and the number of jobs
 in flight that the controller granted. Every request in flight has a unique reference, by which an
 answer finds the operation that sent the request.
@@ -16,6 +20,80 @@ from typing import Protocol
 from shmio.connectors import tcp
 from shmio.connectors.s7 import pdu
 from shmio.errors import ConnectorError
+
+
+class Inbox:
+    """Received bytes, in a buffer of fixed size, and the messages in them. No I/O."""
+
+    def __init__(self, frames: int, longest: int) -> None:
+        """Create a buffer for ``frames`` frames of at most ``longest`` bytes."""
+        self._data = memoryview(bytearray())
+        self._start = self._end = 0  # range of the bytes received, but not yet taken
+        self._parts = bytearray()  # of a message whose last TPDU has not come yet
+        self.reserve(frames, longest)
+
+    def reserve(self, frames: int, longest: int) -> None:
+        """Allocate a buffer for ``frames`` frames of at most ``longest`` bytes. It keeps what was received."""
+        left = self._end - self._start
+        data = memoryview(bytearray(frames * longest + left))
+        data[:left] = self._data[self._start : self._end]
+        self._longest = longest
+        self._data = data
+        self._start, self._end = 0, left
+
+    def room(self) -> memoryview:
+        """Return the free part of the buffer, which is not empty if all complete messages have been taken."""
+        if self._start:
+            left = self._end - self._start
+            self._data[:left] = self._data[self._start : self._end]
+            self._start, self._end = 0, left
+        return self._data[self._end :]
+
+    def add(self, count: int) -> None:
+        """Note that ``count`` bytes were received into :meth:`room`."""
+        self._end += count
+
+    def frame(self) -> memoryview | None:
+        """Return the next complete message as one frame, which is valid until the next ``room``.
+
+        Skip empty TPDUs, and pushes, which answer no request. Return None if no message is complete.
+
+        Raises:
+            ConnectorError: The bytes are not frames, or a message is longer than a frame may be.
+
+        """
+        while (tpdu := self._tpdu()) is not None:
+            frame: memoryview | None = tpdu
+            if pdu.is_data(tpdu) and (self._parts or not pdu.is_whole(tpdu)):
+                frame = self._join(tpdu)
+            if frame is not None and not pdu.is_push(frame):
+                return frame
+        return None
+
+    def _tpdu(self) -> memoryview | None:
+        """Return the next complete frame; None if there is none."""
+        left = self._end - self._start
+        if left < 4:
+            if left:
+                pdu.check_first(self._data, self._start)
+            return None
+        length = pdu.frame_length(self._data, self._start, self._longest)
+        if left < length:
+            return None
+        frame = self._data[self._start : self._start + length]
+        self._start += length
+        return frame
+
+    def _join(self, tpdu: memoryview) -> memoryview | None:
+        """Add a TPDU to its message. Return the message as a frame if the TPDU is its last one, and it has data."""
+        self._parts += tpdu[pdu.FRAME_OVERHEAD :]
+        if (most := self._longest - pdu.FRAME_OVERHEAD) < len(self._parts):
+            raise ConnectorError(f"the controller sent a message of more than {most} bytes in several TPDUs")
+        if not pdu.is_last(tpdu):
+            return None
+        whole = bytes(self._parts)
+        self._parts.clear()
+        return memoryview(pdu.data_frame(whole)) if whole else None
 
 
 class Transport:
@@ -38,21 +116,7 @@ class Transport:
         self._socket.setblocking(False)
         self.taken = 0
         """Number of bytes that the kernel accepted in the last ``send``, even if ``send`` failed."""
-        self.reserve(1, 512)  # longer than any connection confirm
-
-    def reserve(self, frames: int, longest: int) -> None:
-        """Allocate a buffer for ``frames`` frames of at most ``longest`` bytes.
-
-        Take all received frames out of the buffer before you call this.
-        """
-        self._longest = longest
-        self._inbox = memoryview(bytearray(frames * longest))
-        self._start = self._end = 0  # range of the bytes received, but not yet taken
-
-    @property
-    def left(self) -> int:
-        """Number of bytes received but not yet taken."""
-        return self._end - self._start
+        self.inbox = Inbox(1, 512)  # longer than any connection confirm
 
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
         """Send all of ``data``.
@@ -84,36 +148,21 @@ class Transport:
         ready, _, _ = select.select((self._socket,), (), (), _left_s(until_ns))
         if not ready:
             return False
-        if self._start:
-            left = self._end - self._start
-            self._inbox[:left] = self._inbox[self._start : self._end]
-            self._start, self._end = 0, left
-        received = self._socket.recv_into(self._inbox[self._end :])
+        received = self._socket.recv_into(self.inbox.room())
         if not received:
             raise EOFError
-        self._end += received
+        self.inbox.add(received)
         return True
 
-    def frame(self) -> memoryview | None:
-        """Return the next complete frame, which is valid until the next ``receive``; None if there is none."""
-        if self._end - self._start < 4:
-            return None
-        length = pdu.frame_length(self._inbox, self._start, self._longest)
-        if self._end - self._start < length:
-            return None
-        frame = self._inbox[self._start : self._start + length]
-        self._start += length
-        return frame
-
     def next_frame(self, deadline_ns: int) -> memoryview:
-        """Wait for a complete frame and return it.
+        """Wait for a complete message, and return it as one frame.
 
         Raises:
-            TimeoutError: The frame has not arrived by ``deadline_ns``.
+            TimeoutError: The message has not arrived by ``deadline_ns``.
 
         """
-        while (frame := self.frame()) is None:
-            if not self.receive(deadline_ns):
+        while (frame := self.inbox.frame()) is None:
+            if time.monotonic_ns() >= deadline_ns or not self.receive(deadline_ns):
                 raise TimeoutError
         return frame
 

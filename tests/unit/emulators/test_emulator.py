@@ -149,11 +149,11 @@ def test_a_failing_program_is_reported(db201: Layout, monkeypatch: pytest.Monkey
 def test_traits_reach_the_client_and_commands_reach_the_program(db201: Layout) -> None:
     """A client commands a hold: the cell stops all motion, and reports it."""
     with (
-        Emulator(db201, "a50", LOOPBACK, options=ServerOptions(max_pdu_size=480, max_jobs=10)) as emulator,
+        Emulator(db201, "a50", LOOPBACK, options=ServerOptions(max_pdu_size=480, max_jobs=6)) as emulator,
         closing(client_of(emulator)) as client,
     ):
         client.connect()
-        assert (client.pdu_size, client.jobs, client.depth) == (480, 10, 2)
+        assert (client.pdu_size, client.jobs, client.depth) == (480, 6, 1)
         assert client.write([Write(1013, 1, b"\1")]) == [""]
         while not client.read()[1001] & 8:
             pass

@@ -47,7 +47,7 @@ def block() -> bytearray:
 @pytest.fixture
 def jobs(block: bytearray) -> Jobs:
     jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), ServerOptions())
-    assert jobs.answer(SETUP) == bytes.fromhex("32 03 0000 1234 0008 0000 0000 f0 00 0008 0008 03c0")
+    assert jobs.answer(SETUP) == bytes.fromhex("32 03 0000 1234 0008 0000 0000 f0 00 0014 0008 03c0")
     return jobs
 
 
@@ -221,7 +221,7 @@ def test_grants_the_configured_size_and_jobs(block: bytearray) -> None:
     jobs = Jobs(Memory({}), ServerOptions(max_pdu_size=480, max_jobs=19))
     answer = jobs.answer(SETUP)
     assert answer is not None
-    assert answer[14:] == struct.pack(">HHH", 19, 19, 480)
+    assert answer[14:] == struct.pack(">HHH", 20, 19, 480)
     assert len(payload(jobs_of(block, ServerOptions(max_pdu_size=100)).answer(read(item(BYTE, 82, 0))))) == 86
     assert error(jobs_of(block, ServerOptions(max_pdu_size=100)).answer(read(item(BYTE, 83, 0)))) == 0x8500
 

@@ -166,7 +166,7 @@ def test_python_snap7_sees_the_operating_mode(client: snap7.Client) -> None:
 
 
 def test_an_unknown_system_status_list(client: snap7.Client) -> None:
-    with pytest.raises(Exception, match=r"\(0x81\)"):
+    with pytest.raises(Exception, match=r"0xd402"):
         client.read_szl(0x0999)
 
 
@@ -247,7 +247,7 @@ SESSION = bytes.fromhex("0300001611e00000000100c1020100c2020101c0010a")
         SESSION + bytes(5000),
         SESSION + b"\x03\x00\x00\x10" + bytes(12),
         SESSION + b"\x03\x00\xff\xff" + bytes(9000),
-        SESSION + b"\x03\x00\x00\x11\x02\xf0\x00" + bytes(10),
+        SESSION + b"\x03\x00\x03\xc7\x02\xf0\x00" + bytes(960) + b"\x03\x00\x00\x08\x02\xf0\x80\x00",
         SESSION + b"\x03\x00\x00\x11\x02\xf0\x80\x32\x03" + bytes(8),
         SESSION + b"\x03\x00\x00\x19\x02\xf0\x80\x32\x07" + b"\xff" * 16,
         SESSION + bytes.fromhex("03000019 02f080 72 01 0000 0001 0008 0000 f0 00 0008 0008 03c0"),

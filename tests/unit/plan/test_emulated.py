@@ -97,6 +97,7 @@ def test_a_program_runs_on_the_only_table(folder: Path) -> None:
             "layout: this key is needed: program wave runs on one of press, line",
         ),
         ((source("line", "line.toml"), "a50"), "program a50: "),
+        ((source("line", "line.toml"), "profile"), r"emulator\[0\].*profile: unknown profile 's7-30'.*'s7-300'"),
         ((source("cell", "cell.db", "dbNumber = 7\n"), "table"), "dbNumber: leave out this key, because each address"),
         (
             (source("cell", "cell.db", "dbNumber = 6\n"), source("line", "long.toml")),
@@ -111,6 +112,7 @@ def test_faults(folder: Path, parts: tuple[str, ...], reason: str) -> None:
         "dbNumber": "dbNumber = 5\n",
         "wave": 'program = "wave"\n',
         "a50": 'program = "a50"\n',
+        "profile": 'profile = "s7-30"\n',
         "table": 'layout = "press.toml"\ndbNumber = 5\n',
     }.get(last)
     with pytest.raises(ConfigError, match=reason):

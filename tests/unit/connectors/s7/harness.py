@@ -25,7 +25,8 @@ class Plc:
         self._stack = ExitStack()
 
     def client(self, *, size: int = SIZE, db_number: int = 201, **options: object) -> S7Client:
-        given: dict[str, object] = {"host": self.proxy.address.host, "port": self.proxy.address.port, "timeout": 5000}
+        address = self.proxy.address
+        given: dict[str, object] = {"host": address.host, "port": address.port, "timeout": 5000, "maxJobs": 24}
         client = S7Client(S7Options(**{**given, **options}), db_number, size)  # type: ignore[arg-type]
         return self._stack.enter_context(closing(client))
 

@@ -1,8 +1,9 @@
-"""Answers with correct headers and faulty contents."""
+"""Answers with correct headers and faulty contents, and messages in several TPDUs."""
 
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 
 from hypothesis import strategies as st
 
@@ -21,3 +22,17 @@ def _torn(whole: bytes) -> st.SearchStrategy[bytes]:
 def answers(kind: int, parameters: bytes, data: bytes) -> st.SearchStrategy[bytes]:
     """Generate frames with correct headers, but truncated parameters and data, and some noise."""
     return st.builds(answer, st.just(kind), _torn(parameters), _torn(data))
+
+
+EMPTY = bytes.fromhex("03000007 02f000")
+"""A data TPDU without data and without EOT, which Siemens' clients and PC-based controllers send between messages."""
+
+
+def parts_of(frame: bytes, *cuts: int) -> bytes:
+    """Return a message in several TPDUs, which end at these places of its PDU."""
+    pdu = frame[7:]
+    tpdus = [
+        bytes((2, 0xF0, 0x80 if stop == len(pdu) else 0)) + pdu[start:stop]
+        for start, stop in pairwise([0, *cuts, len(pdu)])
+    ]
+    return b"".join(b"\3\0" + (4 + len(tpdu)).to_bytes(2, "big") + tpdu for tpdu in tpdus)

@@ -276,7 +276,7 @@ def test_python_snap7s_client_reads_the_emulators_information() -> None:
         client.connect("127.0.0.1", 0, 1, server.address.port)
         try:
             info = client.get_block_info(Block.DB, 1)
-            with pytest.raises(S7ProtocolError, match="does not exist"):
+            with pytest.raises(S7ProtocolError, match="0xd209"):
                 client.get_block_info(Block.DB, 2)
         finally:
             client.disconnect()

@@ -52,7 +52,15 @@ class Answers:
 
 @pytest.mark.parametrize(
     ("pdu_size", "jobs", "most", "depth"),
-    [(480, 4, None, 1), (480, 9, None, 1), (480, 10, None, 2), (480, 24, None, 4), (960, 24, None, 4), (960, 24, 7, 2)],
+    [
+        (480, 4, 24, 1),
+        (480, 9, 24, 1),
+        (480, 10, 24, 2),
+        (480, 24, 24, 4),
+        (960, 24, 24, 4),
+        (960, 24, 7, 2),
+        (960, 24, None, 2),
+    ],
 )
 def test_depth_follows_the_granted_jobs_and_pdu_size(
     make_plc: MakePlc, pdu_size: int, jobs: int, most: int | None, depth: int

@@ -11,6 +11,7 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import snap7
@@ -321,9 +322,9 @@ def test_an_answer_in_endless_parts_is_refused() -> None:
     class Endless(S7Server):
         asked = 0
 
-        def _process_in_parts(self, request: bytes, *others: object) -> bytes | None:
+        def _process_in_parts(self, request: bytes, *others: Any) -> bytes:
             if request[1] != 7 or request[15] & 15 != 4 or request[-4:-2] == b"\4\x24":
-                return super()._process_in_parts(request, *others)  # type: ignore[arg-type]
+                return super()._process_in_parts(request, *others)
             self.asked += 1
             parameters = bytes.fromhex("000112 08 12") + bytes((0x80 | request[15] & 15, 1, 7)) + b"\0\1\0\0"
             head = struct.pack(">BBHHHH", 0x32, 7, 0, int.from_bytes(request[4:6], "big"), 12, 8)

@@ -58,10 +58,10 @@ def test_reads_octets_and_a_padded_odd_length() -> None:
 @pytest.mark.parametrize(
     ("frame", "text"),
     [
-        (changed(GOOD_ANSWER, _4=3), "several TPDUs"),
+        (changed(GOOD_ANSWER, _4=3), "header 03 f0 80"),
         (changed(GOOD_ANSWER, _5=0x80), "ended the session"),
         (changed(GOOD_ANSWER, _5=0x70), "TPDU 0x70"),
-        (changed(GOOD_ANSWER, _6=0), "several TPDUs"),
+        (changed(GOOD_ANSWER, _6=0), "header 02 f0 00"),
         (changed(GOOD_ANSWER, _7=0x72), "does not speak S7"),
         (changed(GOOD_ANSWER, _8=1), "ROSCTR 1"),
         (changed(GOOD_ANSWER, _8=2), "has no data"),
