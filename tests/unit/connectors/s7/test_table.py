@@ -321,9 +321,9 @@ def test_an_answer_to_other_sizes_is_refused() -> None:
 
 
 def test_an_array_of_bits_leaves_the_rest_of_its_last_byte_to_others() -> None:
-    """A horn has the last bit of a byte whose first three bits are lamps; the values are those of the field's report."""
+    """A horn has the last bit of a byte whose first three bits are lamps."""
     source = FIELD / "bool_array_neighbours/io.toml"
-    layout = compile_tags(source.name, source.read_bytes(), Report()).with_statuses()
+    layout = compile_tags(source.name, source.read_bytes(), Report([source.name])).with_statuses()
     with (
         reserved_port() as address,
         Emulator(layout, "idle", address) as plc,
