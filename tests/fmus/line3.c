@@ -27,6 +27,7 @@ fmi3Instance fmi3InstantiateCoSimulation(
     fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
     fmi3Boolean event_mode, fmi3Boolean early_return, const fmi3ValueReference required[], size_t n,
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
+    if (event_mode && getenv("LINE_WITHOUT_EVENTS")) return NULL;
     Line *line = calloc(1, sizeof *line);
     line->size = 2;
     line->has_events = event_mode;
@@ -128,7 +129,7 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 now, fmi3Float64 step, fmi3Boo
         line->sums[i] = line->level + line->speed;
         for (int j = 0; j < COLUMNS; j++) line->sums[i] += line->factors[i * COLUMNS + j];
     }
-    strcpy(line->name_out, line->name);
+    strcpy(line->name_out, strcmp(line->name, "Latin") ? line->name : "caf\xe9");
     if (!line->has_events) line->mode_out = line->mode;
     return fmi3OK;
 }

@@ -18,6 +18,7 @@ from shmio.simulation.images import Limits
 from shmio.simulation.model import Declaration, Input, Output, Parameter
 from shmio.wording import printable
 
+STRUCTURAL: Final = "structuralParameter"
 NO_STRUCTURE: Final[Mapping[str, int]] = MappingProxyType({})
 EXTRA: Final = "an FMU needs another library; run pip install 'shmio[fmu]'"
 MAX_STRING: Final = 254
@@ -45,7 +46,7 @@ _KINDS: Final[dict[str, type[Input] | type[Output] | type[Parameter]]] = {
     "input": Input,
     "output": Output,
     "parameter": Parameter,
-    "structuralParameter": Parameter,
+    STRUCTURAL: Parameter,
 }
 _REALS: Final = frozenset({"Real", "Float32", "Float64"})
 _IDENTIFIER: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")

@@ -70,21 +70,27 @@ class Instance:
         self._error: type[Exception] = FMICallException
         self.version = description.version
         self._start_s = description.start_s
-        self._has_events = description.has_events
+        self._has_events = False
         self.words = ""
         """The FMU's last message about a problem in the present call."""
         self._status = 0  # the worst status of all calls
-        try:
-            self._fmu: Any = instantiate_fmu(
-                str(folder),
-                description.parsed,
-                "CoSimulation",
-                logger=self._log,
-                early_return_allowed=description.returns_early,
-                event_mode_used=description.has_events,
-            )
-        except Exception as error:  # noqa: BLE001  FMPy raises Exception
-            raise FmuError(self._with_words(f"it cannot be loaded: {shorten(printable(str(error)), 300)}")) from None
+        for event_mode in (True, False) if description.has_events else (False,):
+            try:
+                self._fmu: Any = instantiate_fmu(
+                    str(folder),
+                    description.parsed,
+                    "CoSimulation",
+                    logger=self._log,
+                    early_return_allowed=description.returns_early,
+                    event_mode_used=event_mode,
+                )
+                self._has_events = event_mode
+                break
+            except Exception as error:  # noqa: BLE001  FMPy raises Exception
+                reason = shorten(printable(str(error)), 300)
+                if not event_mode:
+                    raise FmuError(self._with_words(f"it cannot be loaded: {reason}")) from None
+                log.warning("the FMU cannot be loaded with the event mode that it states: %s", reason)
         self._component = ctypes.c_void_p(self._fmu.component)
         self._call_do_step: Callable[..., int] = self._fmu.dll[f"fmi{self.version}DoStep"]
         self._true = _BOOLEAN[self.version](1)
@@ -397,8 +403,18 @@ class Group:
             for view, one in zip(self._views, data, strict=True):
                 view[:] = one
             return
-        self._show([(text or b"").decode(errors="replace") for text in self._texts])
+        self._show([self._text(text or b"") for text in self._texts])
         self._shown = self._texts, [bytes(view) for view in self._views]
+
+    def _text(self, data: bytes) -> str:
+        """Return a text of the FMU. FMI demands UTF-8."""
+        try:
+            return data.decode()
+        except UnicodeDecodeError:
+            log.warning(
+                "the FMU returned a text that is not UTF-8 for one of %s; � stands for its wrong bytes", self.names
+            )
+            return data.decode(errors="replace")
 
     def _show(self, values: list[Any]) -> None:
         if not self._arrays:

@@ -13,12 +13,11 @@ import msgspec
 from shmio.errors import ModelError, ShmioError, SnapshotError
 from shmio.layout.values.codec import nest
 from shmio.simulation.fmu.archive import Archive, Extracted
-from shmio.simulation.fmu.description import NO_STRUCTURE, Description, Variable, describe, start_value
+from shmio.simulation.fmu.description import NO_STRUCTURE, STRUCTURAL, Description, Variable, describe, start_value
 from shmio.simulation.fmu.instance import FmuError, Group, Instance, Outputs
 from shmio.simulation.model import Model
 
 SUFFIX: Final = ".fmu"
-STRUCTURAL: Final = "structuralParameter"
 REMEDY: Final = "; the FMU starts again when its source is restarted"
 MAX_CALLS: Final = 10_000
 """Maximum number of calls of ``doStep`` in one step."""

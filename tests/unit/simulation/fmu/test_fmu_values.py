@@ -129,6 +129,26 @@ def test_events(run: Runner) -> None:
     assert value(runner, "calls") == "initialise update update steps event update update steps event update steps"
 
 
+def test_an_fmu_that_cannot_use_the_event_mode_that_it_states(
+    run: Runner, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An FMU of the reference FMUs (Roberts) states it, and refuses it."""
+    monkeypatch.setenv("LINE_WITHOUT_EVENTS", "1")
+    runner = run()
+    runner.connect({"mode": 7})
+    runner.step(20 * MS, 20 * MS)
+    assert (value(runner, "mode_out"), value(runner, "calls")) == (7, "initialise")
+    assert "event mode that it states" in caplog.text
+
+
+def test_a_text_that_is_not_utf_8_is_logged(run: Runner, caplog: pytest.LogCaptureFixture) -> None:
+    runner = run()
+    runner.connect({"name": "Latin"})
+    runner.step(20 * MS, 20 * MS)
+    assert value(runner, "name_out") == "caf�"
+    assert "not UTF-8 for one of name_out" in caplog.text
+
+
 def test_texts_of_any_length_and_all_characters(run: Runner, folder: Path, tmp_path: Path) -> None:
     runner = run()
     assert find(runner.layout, "name").type == "WSTRING[254]"
