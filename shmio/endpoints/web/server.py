@@ -399,7 +399,7 @@ class HttpServer:
         Raises:
             EndpointError: The address cannot be used.
         """
-        log_loop_errors()
+        log_loop_errors(asyncio.get_running_loop())
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
