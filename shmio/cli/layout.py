@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
 
 from shmio.cli import layout_import
 from shmio.cli.common import add_json, complete, dumps, run
+from shmio.cli.layout_options import add_encoding, add_type_bytes, read_source
 from shmio.errors import ConfigError, LayoutError
-from shmio.layout.compiler import Program, Source
+from shmio.layout.compiler import Program
 from shmio.layout.image import initial_value_warnings
-from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
-from shmio.layout.source.lexer import MAX_SOURCE_BYTES
+from shmio.layout.model import Layout, Register
 from shmio.version import __version__
 from shmio.wording import counted, printable, unknown
 
@@ -28,8 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     complete(parser)
     options = parser.parse_intermixed_args(arguments)
-    names, sizes = [options.file, *options.types], dict(options.type_bytes)
-    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json), options)
+    return run(parser.prog, lambda: _compile(options), options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -39,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
         "path, type, byte offset, bit, size. 'shmio-layout import FILE' converts a tag list "
         "into a tag table; see its --help.",
     )
-    parser.add_argument("file", metavar="FILE", help="the source with the data blocks (.db, .awl, .scl)")
+    parser.add_argument("file", metavar="FILE", help="the source with the data blocks (.db, .awl, .scl, .s7dcl)")
     parser.add_argument(
         "types",
         metavar="SOURCE",
@@ -48,34 +46,26 @@ def _parser() -> argparse.ArgumentParser:
         "over its data blocks",
     )
     parser.add_argument("--block", metavar="NAME", help="only this data block; ignore errors in others")
+    add_type_bytes(parser)
+    add_encoding(parser)
     parser.add_argument(
-        "--type-bytes",
-        metavar="TYPE=BYTES",
-        type=_size,
-        action="append",
-        default=[],
-        help="the size of a type whose members are not known; shmio treats its values as bytes without meaning",
+        "--by-name",
+        action="store_true",
+        help='compile for reading by OPC UA with nodes = "siemens": no type needs a size, and offsets have no meaning',
     )
     add_json(parser, "print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     return parser
 
 
-def _size(text: str) -> tuple[str, int]:
-    name, _, number = text.rpartition("=")
-    size = int(number) if number.isascii() and number.isdecimal() and len(number) < 8 else 0
-    if not name or not 1 <= size <= MAX_BLOCK_BYTES:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a type and its bytes, such as TON_TIME=16")
-    return name.strip('"'), size
-
-
-def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], *, as_json: bool) -> int:
-    program = Program([_read(name) for name in names])
+def _compile(options: argparse.Namespace) -> int:
+    block, sizes = options.block, dict(options.type_bytes)
+    program = Program([read_source(name, options.encoding) for name in (options.file, *options.types)])
     if block is not None and block.lower() not in {one.name.lower() for one in program.blocks}:
         program.compile(())  # reports damaged sources first
         raise ConfigError(f"--block: {unknown('data block', block, (one.name for one in program.blocks))}")
     try:
-        compiled = program.compile(None if block is None else (block,), sizes)
+        compiled = program.compile(None if block is None else (block,), sizes, by_name=options.by_name)
     except LayoutError as error:
         _complain(one for one in error.diagnostics if one.severity == "warning")  # the error's text has the errors
         raise
@@ -83,14 +73,8 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
     _complain(f"warning: --type-bytes: no member has the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:
         _complain(_unread(layout))
-    _print(compiled.layouts, as_json=as_json)
+    _print(compiled.layouts, as_json=options.json)
     return 0
-
-
-def _read(name: str) -> Source:
-    """Read a file. If it is too large, read just enough that the compiler refuses it."""
-    with Path(name).open("rb") as file:
-        return Source(name, file.read(MAX_SOURCE_BYTES + 4))
 
 
 def _complain(lines: Iterable[object]) -> None:

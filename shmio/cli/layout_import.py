@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio.cli.common import run
+from shmio.cli.layout_options import add_encoding, add_type_bytes, read_source
+from shmio.layout.foreign import FORMATS
 from shmio.layout.importing.found import ImportingError
-from shmio.layout.importing.importer import FORMATS, MAX_BYTES, import_tags
+from shmio.layout.importing.importer import MAX_BYTES, import_tags
 from shmio.wording import EXISTS, NOT_TOML, printable
 
 
@@ -17,7 +19,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run ``shmio-layout import``. Return its exit status: 0 for success, 1 for a failure, 2 for wrong usage."""
     parser = parser_of_import()
     options = parser.parse_args(arguments)
-    return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)
+    return run(parser.prog, lambda: _import(options), options)
 
 
 def parser_of_import() -> argparse.ArgumentParser:
@@ -28,6 +30,13 @@ def parser_of_import() -> argparse.ArgumentParser:
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="the list that the vendor's tool has exported")
     parser.add_argument(
+        "further",
+        metavar="SOURCE",
+        nargs="*",
+        help="for XML of data blocks: further files, with the PLC data types, function blocks and constants that they "
+        "use (.xml, .udt, .scl, .s7dcl)",
+    )
+    parser.add_argument(
         "-o", "--output", metavar="TABLE.toml", type=Path, help="the new tag table; default: standard output"
     )
     parser.add_argument(
@@ -35,23 +44,40 @@ def parser_of_import() -> argparse.ArgumentParser:
         action="store_true",
         help="allow commands to write what the vendor's tool lets other programs write",
     )
+    add_encoding(parser)
+    add_type_bytes(parser)
+    parser.add_argument(
+        "--by-name",
+        action="store_true",
+        help='leave out the addresses of a data block, to read it by OPC UA with nodes = "siemens"',
+    )
     return parser
 
 
-def _import(file: Path, output: Path | None, *, writable: bool) -> int:
+def _import(options: argparse.Namespace) -> int:
+    file: Path = options.file
+    output: Path | None = options.output
     if output is not None and output.suffix != ".toml":
         raise ImportingError(f"{output}: {NOT_TOML}")
     with file.open("rb") as stream:
         data = stream.read(MAX_BYTES + 1)
+    further = [read_source(name, options.encoding, MAX_BYTES) for name in options.further]
     try:
-        found = import_tags(data)
+        found = import_tags(
+            data,
+            str(file),
+            further=further,
+            encoding=options.encoding or "",
+            type_bytes=dict(options.type_bytes),
+            by_name=options.by_name,
+        )
     except ImportingError as error:
         raise ImportingError(f"{file}: {error}") from None
     for line in found.report():
         print(printable(line), file=sys.stderr)
     if not found.tags:
         raise ImportingError(f"{file}: the file has nothing to import")
-    table = found.to_toml(file.name, writable=writable)
+    table = found.to_toml(file.name, writable=options.writable)
     if output is None:
         print(table, end="")
         return 0

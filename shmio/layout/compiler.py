@@ -12,15 +12,18 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
+import msgspec
+
 from shmio.errors import Diagnostic
 from shmio.layout import emit, tags
+from shmio.layout.foreign import foreign, misplaced_list
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Layout
 from shmio.layout.overlay_table import OverlayTable, lay_tables
-from shmio.layout.place import MAX_TEXT, Cost, Group, Placer
+from shmio.layout.place import MAX_TEXT, Cost, Group, Placer, Unknown
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.source import lexer, parser
 from shmio.layout.source.constants import Constants
-from shmio.layout.source.file import decode, foreign
+from shmio.layout.source.file import EASTERN, decode
 from shmio.layout.source.syntax import (
     Array,
     BlockDeclaration,
@@ -41,8 +44,7 @@ _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, Consta
 _OPTIMIZED = (
     "the block {name} has optimized access: its values have no fixed addresses and the classic S7 protocol cannot "
     "read them; switch off 'Optimized block access' in the block's properties, and compile and load the block; or read "
-    'it by OPC UA: connector = "opcua" with nodes = "siemens". The offsets are those it would have with standard '
-    "access"
+    'it by OPC UA: connector = "opcua" with nodes = "siemens". Offsets have no meaning in such a block'
 )
 _MARK = " has optimized access: "
 
@@ -53,6 +55,16 @@ class Source:
 
     file: str
     text: bytes
+    encoding: str = ""
+    """Encoding of a text without byte order mark, one of :data:`shmio.layout.encodings.ENCODINGS`; "" if unknown."""
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """The declarations of a file in another format, which an importer has read."""
+
+    file: str
+    unit: Unit
 
 
 @dataclass(frozen=True)
@@ -102,7 +114,7 @@ def compile_sources(
 class Program:
     """Parsed sources, whose data blocks you can compile together or one at a time."""
 
-    def __init__(self, sources: Sequence[Source]) -> None:
+    def __init__(self, sources: Sequence[Source | Parsed]) -> None:
         """Parse the sources.
 
         Raises:
@@ -121,9 +133,16 @@ class Program:
         with suppress(TooManyErrors):
             self._read(sources)
 
-    def _read(self, sources: Sequence[Source]) -> None:
+    def _read(self, files: Sequence[Source | Parsed]) -> None:
         report = self._general
+        self._units = [file.unit for file in files if isinstance(file, Parsed)]
+        sources = [file for file in files if isinstance(file, Source)]
         tables = [source for source in sources if source.file.lower().endswith(tags.SUFFIXES)]
+        for table in tables:
+            if what := misplaced_list(table.file, table.text):
+                report.add(Diagnostic(table.file, 1, 1, what))
+        if tables:
+            report.raise_errors()
         if tables and len(tables) == len(sources):
             if len(tables) > 1:
                 what = (
@@ -148,7 +167,7 @@ class Program:
         self._by_name(blocks)
         self.blocks = tuple(BlockName(block.name, block.number) for block in blocks)
         if not blocks and not report.errors and not any(fault.severity == "error" for fault in self._faults()):
-            file = sources[0].file if sources else "<none>"
+            file = files[0].file if files else "<none>"
             report.add(Diagnostic(file, 1, 1, "the files have no DATA_BLOCK"))
 
     def _by_name(self, declarations: Sequence[_Declaration]) -> tuple[dict[str, _Declaration], dict[str, Diagnostic]]:
@@ -175,8 +194,17 @@ class Program:
                     yield from declaration.faults
         yield from self._doubles
 
-    def compile(self, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None) -> Compiled:
+    def compile(
+        self,
+        blocks: Collection[str] | None = None,
+        type_bytes: Mapping[str, int] | None = None,
+        *,
+        by_name: bool = False,
+    ) -> Compiled:
         """Compile the data blocks named in ``blocks`` (None: all). :func:`compile_sources` explains the arguments.
+
+        With ``by_name``, the members will be read by their names: no type needs a size, and the places of
+        the members have no meaning. This is always so for blocks with optimized access.
 
         Raises:
             LayoutError: A source is wrong; ``diagnostics`` has all errors, then all warnings.
@@ -189,13 +217,14 @@ class Program:
         with suppress(TooManyErrors):
             report.extend((*self._general.errors, *self._general.warnings))
             constants = Constants(self._constants.values())
-            placer = Placer(self._types, constants, report, type_bytes or {})
+            placers = [Placer(self._types, constants, report, type_bytes, by_name=named) for named in (False, True)]
             wanted = [block for unit in self._units for block in unit.blocks]
             if blocks is None:
                 report.extend(self._faults())
+                all_named = by_name or all(map(self._is_optimized, wanted))
                 for declaration in self._types.values():
                     if declaration.body.members and not declaration.is_function_block:
-                        placer.named(Named(declaration.name, True, declaration.position))
+                        placers[all_named].named(Named(declaration.name, True, declaration.position))
             else:
                 names = {name.lower() for name in blocks}
                 wanted = [block for block in wanted if block.name.lower() in names]
@@ -203,8 +232,12 @@ class Program:
             spent = Cost()
             for block in wanted:
                 own = Constants(block.constants, constants)
-                group = _body(block, own, placer, report)
+                named = by_name or self._is_optimized(block)
+                group = _body(block, own, placers[named], report)
                 if group is None:
+                    continue
+                if group.open and not group.cost.registers:
+                    report.add(msgspec.structs.replace(group.open.why, severity="error"))
                     continue
                 spent = spent.plus(group.cost, 1, 0)
                 if spent.registers > MAX_ALL_REGISTERS or spent.structures > MAX_ALL_STRUCTURES:
@@ -221,7 +254,8 @@ class Program:
                 held = [block.name for block in self.blocks]
                 layouts = lay_tables(self._overlays, layouts, held, report, chosen=blocks is not None)
         report.raise_errors()
-        unused = tuple(name for name in type_bytes or () if name.lower() not in placer.placed)
+        used = {key for placer in placers for key in placer.placed}
+        unused = tuple(name for name in type_bytes or () if name.lower() not in used)
         return Compiled(tuple(layouts), tuple(report.warnings), unused)
 
     def _report_chosen(self, wanted: Sequence[BlockDeclaration], report: Report) -> None:
@@ -255,7 +289,10 @@ def _read(source: Source, report: Report) -> Unit:
     if what := foreign(source.file, source.text):
         report.add(Diagnostic(source.file, 1, 1, what))
         return Unit()
-    decoded = decode(source.text)
+    decoded = decode(source.text, source.encoding)
+    if decoded.eastern:
+        report.add(Diagnostic(source.file, decoded.line, decoded.column, EASTERN))
+        return Unit()
     if decoded.problem:
         severity: Literal["error", "warning"] = "error" if decoded.fatal else "warning"
         report.add(Diagnostic(source.file, decoded.line, decoded.column, decoded.problem, severity))
@@ -296,6 +333,9 @@ def _body(block: BlockDeclaration, constants: Constants, placer: Placer, report:
     found = placer.named(body)
     if found is None or isinstance(found, Group):
         return found
+    if isinstance(found, Unknown):
+        report.add(msgspec.structs.replace(found.why, severity="error"))
+        return None
     what = f"expected STRUCT, VAR or the name of a PLC data type or function block, found {body.name}"
     report.add(body.position.error(what))
     return None

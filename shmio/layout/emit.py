@@ -136,11 +136,12 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
     if items and all(_NAMED.fullmatch(item) for item in items):
         return dict(_by_name(items, group))
     values: dict[str, str] = {}
-    names = iter(group.fields)
-    for item in _repeated(items, len(group.fields)):
+    all_names = group.names or tuple(group.fields)
+    names = iter(all_names)
+    for item in _repeated(items, len(all_names)):
         name = next(names, None)
         if name is None:
-            raise ValueRangeError(f"expected at most {len(group.fields)} values, found {brief(text)}")
+            raise ValueRangeError(f"expected at most {len(all_names)} values, found {brief(text)}")
         if item not in ("", "()"):
             values[name] = item
     return values
@@ -165,7 +166,7 @@ def _by_name(items: list[str], group: Group) -> Iterator[tuple[str, str]]:
     for item in items:
         if match := _NAMED.fullmatch(item):
             name = match[1] or match[2] or ""
-            if name.lower() not in group.fields:
+            if name.lower() not in (group.names or group.fields):
                 raise ValueRangeError(f"expected a member of the structure, found {name!r}")
             yield name.lower(), match[3].strip()
 
@@ -249,6 +250,8 @@ def _target(group: Group, assignment: Assignment) -> _Target | str | None:
         if place.opaque:
             return None
         field = place.fields.get(part.lower()) if isinstance(part, str) else None
+        if field is None and isinstance(part, str) and part.lower() in place.names:
+            return None
         if field is None:
             return f"expected a member of this block, found {_written(part)}"
         path, place = (f"{path}/" if path else "") + field.segment, field.type

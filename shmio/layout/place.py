@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from shmio.errors import Diagnostic
 from shmio.layout.model import (
     BYTE,
     MAX_BLOCK_BYTES,
@@ -64,13 +65,34 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A placed structure. ``size`` is in bytes and always even. ``opaque`` is true if the members are unknown."""
+    """A placed structure.
 
-    fields: dict[str, Field]  # by name in lower case: S7 names are case-insensitive
+    Attributes:
+        fields: The members by name in lower case, because S7 names are case-insensitive.
+        size: Size in bytes, always even.
+        cost: Cost of the expansion.
+        height: Number of levels of structures.
+        opaque: True if the members are unknown.
+        names: Names of all members in lower case, in order, if some have no field; else ().
+        open: The member type because of which the size is unknown, and ``size`` is only that of the
+            first members; None if the size is known.
+
+    """
+
+    fields: dict[str, Field]
     size: int
     cost: Cost
     height: int
     opaque: bool = False
+    names: tuple[str, ...] = ()
+    open: Unknown | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A type whose members and size are unknown; ``why`` says what to do about it."""
+
+    why: Diagnostic
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,12 +177,26 @@ class Placer:
         constants: Constants,
         report: Report,
         type_bytes: Mapping[str, int] | None = None,
+        *,
+        by_name: bool = False,
     ) -> None:
+        """Create a placer.
+
+        Args:
+            types: The user types, by name in lower case.
+            constants: The constants of all sources.
+            report: Receives errors and warnings.
+            type_bytes: Sizes in bytes of types whose members are unknown, by name.
+            by_name: True if the members are read by their names. Then their places have no meaning, and
+                no type needs a size.
+
+        """
         self._types = types
+        self._by_name = by_name
         self._type_bytes = {name.lower(): size for name, size in (type_bytes or {}).items()}
         self._global = self._constants = constants
         self._report = report
-        self.placed: dict[str, Group | None] = {}
+        self.placed: dict[str, Group | Unknown | None] = {}
         """The placed types by name in lower case; None for a type with errors."""
         self._open: dict[str, str] = {}  # names of the types that are being placed, by key
 
@@ -183,7 +219,8 @@ class Placer:
         fields: dict[str, Field] = {}
         bits = height = 0
         cost = Cost()
-        good = True
+        good, complete = True, True
+        cause: Unknown | None = None
         section: Section | None = None
         for member in struct.members:
             if member.section is not section:
@@ -193,6 +230,13 @@ class Placer:
             placed = self._member(member, fields, depth)
             if placed is None:
                 good = False
+                continue
+            if cause is not None:
+                continue
+            unknown = _unknown_in(placed)
+            if isinstance(placed, Unknown) or (unknown is not None and isinstance(placed, Repeat)):
+                complete = False
+                cause = None if self._by_name else unknown
                 continue
             extent = _extent_of(placed)
             if isinstance(placed, Leaf) and placed.element.base == "BOOL" and not placed.dims:
@@ -209,9 +253,14 @@ class Placer:
             known = member if initial == member.initial else replace(member, initial=initial)
             fields[member.name.lower()] = Field(segment, known, placed, offset, bit)
             good = good and self._fits(member.position, _round_up(bits, 8) // 8, cost, height)
-        return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height) if good else None
+            if unknown is not None:
+                complete, cause = False, unknown
+        if not good:
+            return None
+        names = tuple(member.name.lower() for member in struct.members) if not complete else ()
+        return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height, names=names, open=cause)
 
-    def named(self, name: Named) -> ElementType | Group | None:
+    def named(self, name: Named) -> ElementType | Group | Unknown | None:
         """Return the elementary or user type with a name; report an error and return None if there is none."""
         try:
             return self._named(name, 0)
@@ -219,11 +268,13 @@ class Placer:
             self._report.add(fault.diagnostic)
             return None
 
-    def _named(self, name: Named, depth: int) -> ElementType | Group | None:
+    def _named(self, name: Named, depth: int) -> ElementType | Group | Unknown | None:
         if not name.quoted and (element := self._elementary(name)):
             return element
         key = name.name.lower()
-        if key not in self.placed and key in self._type_bytes:
+        if key not in self._types and key.rpartition(".")[2] in self._types:  # declared without its software unit
+            key = key.rpartition(".")[2]
+        if key not in self.placed and key in self._type_bytes and not self._by_name:
             self.placed[key] = _opaque(name, self._type_bytes[key])
         if key in self._open:
             keys = [*self._open]
@@ -232,11 +283,17 @@ class Placer:
             return None
         if key not in self.placed:
             declaration = self._types.get(key) or system_types.declarations().get(key)
+            if declaration is None and self._by_name:
+                declaration = system_types.named().get(key)
             if declaration is not None:
                 self.placed[key] = self._declared(key, declaration, depth)
-            elif size := system_types.length(name.name):
+            elif (size := system_types.length(name.name)) and not self._by_name:
                 self._report.add(name.position.warning(_OPAQUE.format(name=name.name, size=size)))
                 self.placed[key] = _opaque(name, size)
+            elif system_types.length(name.name) or system_types.refusal(name.name) or key in self._type_bytes:
+                why = name.position.warning(self._left_out(name))
+                self._report.add(why)
+                self.placed[key] = Unknown(why)
             else:
                 self._refuse(name.position, self._unknown(name))
                 return None
@@ -267,7 +324,7 @@ class Placer:
             raise BoundFault(name.position.error(what))
         return element_type(f"{name.name}[{length}]")
 
-    def _member(self, member: Member, fields: dict[str, Field], depth: int) -> Leaf | Group | Repeat | None:
+    def _member(self, member: Member, fields: dict[str, Field], depth: int) -> Leaf | Group | Repeat | Unknown | None:
         first = fields.get(member.name.lower())
         if first is not None:
             line = first.member.position.line
@@ -284,14 +341,14 @@ class Placer:
             self._report.add(fault.diagnostic)
             return None
 
-    def _type(self, type_: Type, depth: int) -> Leaf | Group | Repeat | None:
+    def _type(self, type_: Type, depth: int) -> Leaf | Group | Repeat | Unknown | None:
         inner = type_.element if isinstance(type_, Array) else type_
         dims = self._dims(type_.bounds, type_.position) if isinstance(type_, Array) else ()
         found = self._named(inner, depth) if isinstance(inner, Named) else self.struct(inner, depth)
         if isinstance(found, Group):
             return Repeat(found, dims) if dims else found
-        if found is None:
-            return None
+        if found is None or isinstance(found, Unknown):
+            return found
         leaf = Leaf(found, dims, 0)
         return Leaf(found, dims, array_size(found, leaf.shape))
 
@@ -319,13 +376,22 @@ class Placer:
                 return False
         return True
 
-    def _unknown(self, name: Named) -> str:
-        if reason := system_types.refusal(name.name):
+    def _left_out(self, name: Named) -> str:
+        """Return the warning about a member of a system type whose members are unknown."""
+        reason = system_types.refusal(name.name) or "its members are not public"
+        if self._by_name:
             return (
-                f"shmio does not know the members of the system type {name.name}: {reason}; declare it as a PLC data "
-                f'type, TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE, or give only its size by '
-                f"{_SIZE.format(name=name.name)}"
+                f"shmio does not know the members of the type {name.name}, and leaves out what has this type; "
+                f'declare it as a PLC data type, TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE, to read it'
             )
+        return (
+            f"shmio does not know the members of the system type {name.name}: {reason}; it leaves them out, and the "
+            "members after them, because their addresses depend on its size; declare it as a PLC data type, TYPE "
+            f'"{name.name}" STRUCT … END_STRUCT; END_TYPE, or give only its size by {_SIZE.format(name=name.name)}, or '
+            'read the block by OPC UA: connector = "opcua" with nodes = "siemens"'
+        )
+
+    def _unknown(self, name: Named) -> str:
         return (
             f"unknown type {name.name!r}; if it is a PLC data type or a function block, name its source (.udt, .scl, "
             f".awl) as well; or give only its size by {_SIZE.format(name=name.name)}"
@@ -334,6 +400,13 @@ class Placer:
     def _refuse(self, position: Position, message: str) -> None:
         """Report an error at this position."""
         self._report.add(position.error(message))
+
+
+def _unknown_in(placed: Leaf | Group | Repeat | Unknown) -> Unknown | None:
+    """Return the type because of which the size of a member is unknown; None if it is known."""
+    if isinstance(placed, Unknown):
+        return placed
+    return placed.open if isinstance(placed, Group) else placed.group.open if isinstance(placed, Repeat) else None
 
 
 def _opaque(name: Named, size: int) -> Group:

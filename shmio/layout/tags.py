@@ -20,8 +20,7 @@ its elements.
 With ``scale = factor`` or ``scale = [factor, offset]``, the connector computes the value from the
 device's number: number * factor + offset. ``deadband`` is the largest change of the value that the
 connector may ignore. ``writable = true`` has the same effect as naming the register in the
-source's ``writable``. ``word_order`` and ``byte_order`` of a register override those of a Modbus
-source. They become a part of the address, so that layouts need no keys for one protocol.
+source's ``writable``.
 """
 
 from __future__ import annotations
@@ -73,8 +72,8 @@ _KEY = re.compile(rf"^[ \t]*(?:(?:{_TABLE})?{_NAME}[.=]|\[[ \t]*{_TABLE}{_NAME}[
 _ARRAY = re.compile(r"ARRAY\s*\[([^\]]*)\]\s*OF\s+(\S+)", re.IGNORECASE)
 _BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
 _PATH = re.compile(r"[/.%]")
-_TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
-_COMMON: Final = (*NUMBERS, *_TEXTS, "BOOL", "TIME", "LTIME", "DATE", *CONTENTS)
+TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
+_COMMON: Final = (*NUMBERS, *TEXTS, "BOOL", "TIME", "LTIME", "DATE", *CONTENTS)
 """The types to suggest in place of a misspelled type."""
 _Scalar = bool | int | float | str
 _Read = TypeVar("_Read")
@@ -89,8 +88,6 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     scale: float | tuple[float, float] | None = None
     deadband: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     writable: bool = False
-    word_order: ByteOrder | None = None
-    byte_order: ByteOrder | None = None
 
 
 class _Table(msgspec.Struct, forbid_unknown_fields=True):
@@ -321,7 +318,7 @@ class _Placer:
         initial = None if tag.initial is None else _literal(tag.initial, element)
         register = Register(
             path, element.name, dims, offset, bit, size, math.prod(shape), tag.comment, initial,
-            unit=tag.unit, address=_address(tag), scale=_scale(tag, element), deadband=_deadband(tag, element),
+            unit=tag.unit, address=tag.address, scale=_scale(tag, element), deadband=_deadband(tag, element),
             writable=tag.writable,
         )  # fmt: skip
         if initial is not None:
@@ -331,18 +328,6 @@ class _Placer:
         self._keys[path] = key
         self._end = offset + size
         self._elements += register.count
-
-
-def _address(tag: _Tag) -> str:
-    """Return the address with the orders of words and bytes; raise ValueError if there is no address to have them."""
-    orders = [
-        f" {key}={order}" for key, order in (("word_order", tag.word_order), ("byte_order", tag.byte_order)) if order
-    ]
-    if orders and not tag.address:
-        raise ValueError(
-            f"{orders[0].split('=')[0].strip()}: only a Modbus address has an order; add the key `address`"
-        )
-    return tag.address + "".join(orders)
 
 
 def _scale(tag: _Tag, element: ElementType) -> tuple[float, float] | None:
@@ -443,7 +428,7 @@ def _literal(value: _Scalar | list[_Scalar], element: ElementType) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_literal(item, element) for item in value)}]"
     if isinstance(value, str):
-        if element.base not in _TEXTS:
+        if element.base not in TEXTS:
             return value
         escaped = value.replace("$", "$$").replace("'", "$'")
         return f"{'W' + element.base.removeprefix('W') + '#' if element.base.startswith('W') else ''}'{escaped}'"

@@ -39,8 +39,8 @@ class LayoutFiles:
             key: The key of the section, for messages.
             section: The section that names the files.
             number: Number of the block; None if the section has no such key.
-            optimized: True if the section can use a block with optimized access, so that no warning
-                about such access is needed.
+            optimized: True if the section reads the members by their names, so that it can use a block
+                with optimized access, and no type needs a size.
 
         Raises:
             ConfigError: A file or block is missing, or the section does not say which block it means.
@@ -90,10 +90,10 @@ class LayoutFiles:
     ) -> tuple[Layout, ...]:
         """Compile one block, or all blocks if ``block`` is None."""
         sizes = section.type_bytes
-        which = paths, block and block.lower(), tuple(sorted(sizes.items()))
+        which = paths, block and block.lower(), tuple(sorted(sizes.items())), optimized
         if which not in self._compiled:
             try:
-                self._compiled[which] = program.compile(None if block is None else (block,), sizes)
+                self._compiled[which] = program.compile(None if block is None else (block,), sizes, by_name=optimized)
             except LayoutError as error:
                 self._compiled[which] = error
         found = self._compiled[which]

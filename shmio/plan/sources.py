@@ -289,15 +289,13 @@ def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tupl
 
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
-    found, inputs, notices = describe(key, msgspec.convert(source.options, Simulation.Options), layout)
-    files.odd += [f"{key}.model: {notice}" for notice in notices]
-    return found, inputs
+    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
 
 
 def describe(
     key: str, options: Simulation.Options, layout: Layout | None, name: str = "model"
-) -> tuple[Layout, tuple[str, ...], tuple[str, ...]]:
-    """Return the layout of a model's block, the paths of its inputs, and what the user should know.
+) -> tuple[Layout, tuple[str, ...]]:
+    """Return the layout of a model's block, and the paths of its inputs.
 
     A separate process imports the model.
 
@@ -331,7 +329,7 @@ def describe(
     if answer.error:
         text = f"{name}: {answer.error[7:]}" if answer.error.startswith("model: ") else answer.error
         raise ConfigError(f"{key}.{text}")
-    return load_layout(answer.layout.encode()), answer.inputs, answer.notices
+    return load_layout(answer.layout.encode()), answer.inputs
 
 
 def _check_connections(

@@ -78,7 +78,7 @@ def _write(arguments: argparse.Namespace, found: Browsed) -> None:
     table = Found("a device")
     for one in found.offers:
         if one.type:
-            table.add(one.names, one.type, **one.columns)
+            table.add(one.names, one.type, one.columns)
         elif one.refused:
             table.skip("/".join(one.names), one.refused)
     for line in table.report():

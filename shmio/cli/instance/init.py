@@ -26,8 +26,8 @@ from shmio.config.web import check_library
 from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
+from shmio.layout.foreign import HEAD_BYTES, foreign
 from shmio.layout.model import Layout
-from shmio.layout.source.file import HEAD_BYTES, foreign
 from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use
 from shmio.segment import instances

@@ -2,84 +2,96 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-import re
 from collections.abc import Mapping
 from typing import Final
 
-from shmio.layout.importing.found import Found, ImportingError
-from shmio.layout.source.file import decode
+from shmio.layout.foreign import KEPSERVER
+from shmio.layout.importing import kepserver_address
+from shmio.layout.importing.found import Found, ImportingError, of_modbus, of_s7
+from shmio.layout.model import element_type
+from shmio.layout.rows import delimiter_of, rows
 
-FIRST: Final = "tag name"
-_TYPES: Final = {
-    "boolean": "BOOL", "char": "SINT", "byte": "USINT", "short": "INT", "word": "UINT", "long": "DINT",
-    "dword": "UDINT", "llong": "LINT", "qword": "ULINT", "float": "REAL", "double": "LREAL", "string": "STRING",
-}  # fmt: skip
-_ARRAY: Final = re.compile(r"(.*?)\s*\[([0-9]{1,6})\]")
+_CLAMPS: Final = ("clamp low", "clamp high")
+_YES: Final = frozenset({"1", "true", "yes"})
+_ACCESS: Final = {"r/w": True, "rw": True, "read/write": True, "ro": False, "r": False, "readonly": False, "": False}
+"""Whether clients may write, by access right; others, such as WO, cannot be read."""
+_WORD_ORDER: Final = (
+    "the file does not say in which order the device has the words of numbers with 32 and 64 bits: KEPServerEX reads "
+    'the low word first, unless the device\'s settings say otherwise; shmio does so with word_order = "little"'
+)
 
 
-def read(data: bytes) -> Found:
+def read(text: str) -> Found:
     """Return the tags of the file; raise ImportingError if it is not such an export."""
-    text = decode(data).text
-    first = text.partition("\n")[0]
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count))
     found = Found("tags of KEPServerEX")
-    try:
-        header = [name.strip().lower() for name in next(reader, [])]
-        if missing := [name for name in (FIRST, "address", "data type") if name not in header]:
-            raise ImportingError(f"the first row does not have the columns {', '.join(missing)} of KEPServerEX")
-        for cells in reader:
-            row = {name: cell.strip() for name, cell in zip(header, cells, strict=False)}
-            if row.get(FIRST):
-                _add(found, row)
-    except csv.Error as error:
-        raise ImportingError(f"the file is not an export of KEPServerEX: {error}") from None
+    clamped: list[str] = []
+    lines = rows(text, delimiter_of(text.lstrip().partition("\n")[0]))
+    header = [name.lower().replace(".", "") for name in next(lines, (1, []))[1]]
+    if missing := [name for name in (KEPSERVER, "address", "data type") if name not in header]:
+        raise ImportingError(f"the first row does not have the columns {', '.join(missing)} of KEPServerEX")
+    for line, cells in lines:
+        row = dict(zip(header, cells, strict=False))
+        if len(cells) < len(header) or any(cells[len(header) :]):
+            what = f"expected {len(header)} cells, as in the first row, found {len(cells)}"
+            found.skip(row.get(KEPSERVER, ""), what, line)
+        elif not row[KEPSERVER]:
+            found.skip("a row", "the row has no name", line)
+        else:
+            _add(found, row, line, clamped)
+    if clamped:
+        found.remarks.append(
+            f"KEPServerEX limits these values to their scaled limits, and shmio does not: {', '.join(clamped)}"
+        )
     return found
 
 
-def _add(found: Found, row: Mapping[str, str]) -> None:
-    name, address = row[FIRST], row.get("address", "")
-    kind = row.get("data type", "").lower()
-    array = kind.endswith(" array")
-    known = _TYPES.get(kind.removesuffix(" array"))
-    if known is None:
-        return found.skip(name, f"the type {row.get('data type', '')!r} has no counterpart")
-    elements = ""
-    if array:
-        match = _ARRAY.fullmatch(address)
-        if match is None or not int(match[2]):
-            return found.skip(name, "an array without one length at the end of its address, as in 400001 [10]")
-        elements = f"ARRAY[0..{int(match[2]) - 1}] OF "
+def _add(found: Found, row: Mapping[str, str], line: int, clamped: list[str]) -> None:
+    name = row[KEPSERVER]
     try:
-        scale, scaled = _scale(row)
+        place = kepserver_address.translate(row["address"], row["data type"])
+        scale, kind = _scale(row, place.kind)
+        writable = _ACCESS.get(row.get("client access", "").replace(" ", "").lower())
+        if writable is None:
+            raise ValueError(f"the client access {row['client access']!r} does not allow reads")
     except ValueError as error:
-        return found.skip(name, str(error))
-    kind = _TYPES.get(scaled, known) if scale else known
+        return found.skip(name, str(error), line)
+    bounds = ", ".join(f"{low}..{high}" for low, high in place.dims)
+    element = element_type(place.kind)
+    if place.modbus and element and element.base != "STRING" and element.size > 2 and _WORD_ORDER not in found.remarks:
+        found.remarks.append(_WORD_ORDER)
+    if scale and any(row.get(clamp, "").lower() in _YES for clamp in _CLAMPS):
+        clamped.append(f"{name} (line {line})")
     return found.add(
         tuple(part for part in name.split(".") if part),
-        f"{elements}{kind}",
-        address=address,
-        unit=row.get("eng units"),
-        comment=row.get("description"),
-        scale=scale,
-        writable=row.get("client access", "").replace(" ", "").upper() in ("R/W", "RW"),
+        f"ARRAY[{bounds}] OF {kind}" if bounds else kind,
+        {
+            "address": place.address if kind == place.kind else f"{place.address} {place.kind}",
+            "unit": row.get("eng units"),
+            "comment": row.get("description"),
+            "scale": scale,
+            "writable": writable,
+        },
+        line,
+        of_modbus if place.modbus else of_s7,
     )
 
 
-def _scale(row: Mapping[str, str]) -> tuple[list[float] | None, str]:
-    """Return [factor, offset] and the type of the scaled value; None and "" if there is no scaling.
+def _scale(row: Mapping[str, str], raw: str) -> tuple[list[float] | None, str]:
+    """Return [factor, offset] and the type of the scaled value; None and the raw type if there is no scaling.
 
     Raises:
-        ValueError: The scaling is not linear.
+        ValueError: The scaling is not linear, or its limits or types are wrong.
 
     """
     how = row.get("scaling", "").lower()
     if how in ("", "none"):
-        return None, ""
+        return None, raw
     if how != "linear":
         raise ValueError(f"the scaling {row['scaling']!r} is not linear")
+    scaled = kepserver_address.NUMBERS.get(row.get("scaled data type", "").lower())
+    if scaled is None or raw not in kepserver_address.NUMBERS.values():
+        raise ValueError(f"a scaling from {raw} to {row.get('scaled data type', '')!r}; both must be numbers")
     try:
         raw_low, raw_high, low, high = (
             float(row.get(name, "").replace(",", ".")) for name in ("raw low", "raw high", "scaled low", "scaled high")
@@ -88,8 +100,8 @@ def _scale(row: Mapping[str, str]) -> tuple[list[float] | None, str]:
     except (ValueError, ZeroDivisionError):
         raise ValueError("its raw and scaled limits must be four numbers, and the raw limits must differ") from None
     offset = low - raw_low * factor
-    if row.get("negate value", "").lower() in ("1", "true", "yes"):
+    if row.get("negate value", "").lower() in _YES:
         factor, offset = -factor, -offset
     if not math.isfinite(factor) or not math.isfinite(offset) or not factor:
         raise ValueError("its raw and scaled limits must be four numbers, and the raw limits must differ")
-    return [factor, offset], row.get("scaled data type", "").lower()
+    return [factor, offset], scaled

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from typing import Final
-from xml.etree.ElementTree import Element
 
+from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import escaped_uri, node_text
 from shmio.layout.importing.found import Found, ImportingError
+from shmio.layout.importing.xml_tree import Node
+from shmio.layout.model import element_type
 
 ROOT: Final = "UANodeSet"
 # Node ids of namespace 0, as the specification numbers them (OPC 10000-6, Annex A).
@@ -33,7 +35,7 @@ _MAX_DEPTH: Final = 100
 class _Model:
     """The nodes of a file, by node id as written in the file."""
 
-    def __init__(self, root: Element) -> None:
+    def __init__(self, root: Node) -> None:
         self.aliases = {name: f"i={number}" for name, number in _NAMES.items()}
         self.aliases |= {one.get("Alias", ""): (one.text or "").strip() for one in root.iterfind("Aliases/Alias")}
         self.uris = [
@@ -83,6 +85,18 @@ class _Model:
             key = self.parents[key]
         return None
 
+    def siemens_type(self, kind: str) -> str | None:
+        """Return the S7 type that a CPU's own data type is named after; None if the type is another.
+
+        TIA Portal names the types of the CPU's namespace, such as BYTE and WORD, in the aliases.
+        """
+        key = self.real(kind)
+        match = _NODE.fullmatch(key)
+        if match is None or int(match[1]) >= len(self.uris) or self.uris[int(match[1])] != siemens.NAMESPACE:
+            return None
+        names = (name.strip('"') for name, other in self.aliases.items() if other == key)
+        return next((name for name in names if element_type(name)), None)
+
     def address(self, key: str) -> str:
         """Return a node id with the URI of its namespace, because servers number namespaces differently."""
         match = _NODE.fullmatch(key)
@@ -91,7 +105,7 @@ class _Model:
         return f"nsu={escaped_uri(self.uris[int(match[1])])};{node_text(match[2])}"
 
 
-def read(root: Element) -> Found:
+def read(root: Node) -> Found:
     """Return the variables of all objects; raise ImportingError if the file has no nodes."""
     model = _Model(root)
     if not model.nodes:
@@ -103,28 +117,31 @@ def read(root: Element) -> Found:
     return found
 
 
-def _add(found: Found, model: _Model, key: str, node: Element) -> None:
+def _add(found: Found, model: _Model, key: str, node: Node) -> None:
     names, problem = model.way(key)
     shown = "/".join(names)
     if problem:
-        return found.skip(shown or _name(node), problem)
-    kind = model.type_of(node.get("DataType", ""))
+        return found.skip(shown or _name(node), problem, node.line)
+    kind = model.type_of(node.get("DataType", "")) or model.siemens_type(node.get("DataType", ""))
     if kind is None:
-        return found.skip(shown, f"the type {node.get('DataType', 'BaseDataType')} has no counterpart")
+        return found.skip(shown, f"the type {node.get('DataType', 'BaseDataType')} has no counterpart", node.line)
     elements = _elements(node.attrib)
     if elements is None:
-        return found.skip(shown, "an array without fixed lengths")
+        return found.skip(shown, "an array without fixed lengths", node.line)
     access = node.get("AccessLevel", "1")
     rights = int(access) if access.isdecimal() and len(access) < 10 else 1
     if not rights & 1:
-        return found.skip(shown, "the variable cannot be read")
+        return found.skip(shown, "the variable cannot be read", node.line)
     return found.add(
         tuple(names),
         f"{elements}{kind}",
-        address=model.address(key),
-        unit=model.units.get(key),
-        comment=(node.findtext("Description") or "").strip(),
-        writable=bool(rights & 2),
+        {
+            "address": model.address(key),
+            "unit": model.units.get(key),
+            "comment": (node.findtext("Description") or "").strip(),
+            "writable": bool(rights & 2),
+        },
+        node.line,
     )
 
 
@@ -134,12 +151,14 @@ def _elements(node: Mapping[str, str]) -> str | None:
     if rank == "-1":
         return ""
     lengths = [part.strip() for part in node.get("ArrayDimensions", "").split(",")]
+    if (int(rank) if rank.isdecimal() and len(rank) < 3 else 0) not in (0, len(lengths)):
+        return None
     if not all(part.isdecimal() and len(part) < 8 and int(part) for part in lengths):
         return None
     return f"ARRAY[{', '.join(f'0..{int(part) - 1}' for part in lengths)}] OF "
 
 
-def _name(node: Element) -> str:
+def _name(node: Node) -> str:
     """Return a node's name without its namespace, as clients show it."""
     name = node.get("BrowseName", "")
     index, colon, rest = name.partition(":")

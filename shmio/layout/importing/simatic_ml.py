@@ -1,88 +1,166 @@
-"""Import XML that TIA Portal Openness exports (SimaticML): PLC tag tables and global data blocks."""
+"""Import XML that TIA Portal Openness exports (SimaticML): PLC tag tables and data blocks."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from typing import Final
-from xml.etree.ElementTree import Element
 
-from shmio.errors import LayoutError
-from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.importing.found import Found, ImportingError
-from shmio.layout.importing.s7_address import in_block, value_type
-from shmio.layout.model import Register
+from shmio.errors import Diagnostic, LayoutError, ValueRangeError
+from shmio.layout.compiler import Parsed, Program, Source, is_of_access
+from shmio.layout.importing import xml_tree
+from shmio.layout.importing.found import Found, ImportingError, of_s7
+from shmio.layout.importing.plc_tag import CONSTANT, add_plc_tag
+from shmio.layout.importing.simatic_declarations import attribute, comment_of, unit_of
+from shmio.layout.importing.xml_tree import Node
+from shmio.layout.model import Layout, Register
+from shmio.layout.s7.notation import in_block
+from shmio.layout.source.file import decode
+from shmio.layout.tags import TEXTS
 from shmio.layout.topic import decode_segment
+from shmio.layout.values.literal import default_text, parse_literal, scalar_literal, split_array
 
 ROOT: Final = "Document"
-_TYPE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\[[0-9]{1,5}\])?")
-_ARRAY: Final = re.compile(r"Array\[([-0-9., ]+)\] of (.+)", re.IGNORECASE)
+_BLOCKS: Final = ("SW.Blocks.GlobalDB", "SW.Blocks.InstanceDB")
+_MAX_INITIAL: Final = 1000
+"""Maximum number of elements of an array whose initial values are imported."""
 
 
-def read(root: Element) -> Found:
-    """Return the tags of all tag tables and global data blocks; raise ImportingError if there are none."""
+def read(
+    root: Node,
+    name: str,
+    further: Sequence[Source],
+    encoding: str,
+    type_bytes: Mapping[str, int],
+    *,
+    by_name: bool = False,
+) -> Found:
+    """Return the tags of all tag tables and data blocks; raise ImportingError if there are none.
+
+    Args:
+        root: The document.
+        name: Name of its file, for messages.
+        further: Sources, and other documents, with types, function blocks and constants.
+        encoding: Encoding of sources without byte order mark; "": unknown.
+        type_bytes: Sizes in bytes of types whose members are unknown, by name.
+        by_name: True to leave out the addresses of data blocks.
+
+    """
     found = Found("XML of TIA Portal Openness")
-    tables, blocks = list(root.iter("SW.Tags.PlcTagTable")), list(root.iter("SW.Blocks.GlobalDB"))
+    roots = {name: root}
+    sources: list[Source | Parsed] = []
+    for source in further:
+        if decode(source.text[:4096], encoding).text.lstrip("\ufeff \r\n").startswith("<"):
+            try:
+                roots[source.file] = xml_tree.parse(source.text)
+            except ImportingError as error:
+                raise ImportingError(f"{source.file}: {error}") from None
+        else:
+            sources.append(Source(source.file, source.text, source.encoding or encoding))
+    blocks = [(file, node) for file, one in roots.items() for tag in _BLOCKS for node in one.iter(tag)]
+    tables = list(root.iter("SW.Tags.PlcTagTable"))
     if not tables and not blocks:
         others = ", ".join(sorted({child.tag for child in root if child.tag.startswith("SW.")})) or "nothing"
-        raise ImportingError(f"expected a PLC tag table or a global data block, found {others}")
+        raise ImportingError(f"expected a PLC tag table or a data block, found {others}")
     for table in tables:
-        for tag in table.iter("SW.Tags.PlcTag"):
-            _add_tag(found, tag)
-        for constant in table.iter("SW.Tags.PlcUserConstant"):
-            found.skip(_attribute(constant, "Name"), "a constant has no value in the controller")
-    for block in blocks:
-        _add_block(found, block, (_attribute(block, "Name"),) if tables or len(blocks) > 1 else ())
+        for node in table.iter():
+            if node.tag == "SW.Tags.PlcTag":
+                tag, kind, address = (attribute(node, one) for one in ("Name", "DataTypeName", "LogicalAddress"))
+                writable = attribute(node, "ExternalWritable").lower() == "true"
+                add_plc_tag(found, tag, kind, address, node.line, comment=comment_of(node), writable=writable)
+            elif node.tag == "SW.Tags.PlcUserConstant":
+                found.skip(attribute(node, "Name"), CONSTANT, node.line)
+    if blocks:
+        named, placed = (
+            Program([*(Parsed(file, unit_of(file, one, by_name=way)) for file, one in roots.items()), *sources])
+            for way in (True, False)
+        )
+        _add_blocks(
+            found, blocks, named, None if by_name else placed, type_bytes, single=len(blocks) == 1 and not tables
+        )
     return found
 
 
-def _attribute(element: Element, name: str) -> str:
-    return (element.findtext(f"AttributeList/{name}") or "").strip()
+def _add_blocks(
+    found: Found,
+    blocks: Sequence[tuple[str, Node]],
+    named: Program,
+    placed: Program | None,
+    type_bytes: Mapping[str, int],
+    *,
+    single: bool,
+) -> None:
+    """Add the members of data blocks.
+
+    Args:
+        found: Where to add them.
+        blocks: The blocks and their files.
+        named: The program that places members without regard to addresses.
+        placed: The program that places members at their addresses; None to leave them out.
+        type_bytes: Sizes in bytes of types whose members are unknown, by name.
+        single: Whether there is nothing but one block, so that paths need not begin with its name.
+
+    """
+    for _, node in blocks:
+        name = attribute(node, "Name")
+        try:
+            compiled = named.compile((name,), type_bytes, by_name=True)
+            [layout] = compiled.layouts
+            warnings = [*compiled.warnings]
+            addresses: Mapping[str, Register] = {}
+            if placed is not None and not layout.optimized:
+                addresses, more = _placed(placed, name, type_bytes)
+                warnings += more
+        except LayoutError as error:
+            faults = error.diagnostics or (str(error),)
+            found.skip(name, f"the data block cannot be placed: {faults[0]}", node.line)
+            continue
+        shown = [str(one) for one in warnings if not is_of_access(one)]
+        found.remarks += [text for text in dict.fromkeys(shown) if text not in found.remarks]
+        if single:
+            found.block = name
+        if not layout.optimized and placed is not None and layout.number is None:
+            found.remarks.append(f"{name} has no number, so its members have no addresses")
+        _add_block(found, layout, addresses, () if single else (name,), node.line)
 
 
-def _add_tag(found: Found, tag: Element) -> None:
-    name, kind, address = (_attribute(tag, one) for one in ("Name", "DataTypeName", "LogicalAddress"))
-    texts = (text.text or "" for text in tag.iterfind("ObjectList/MultilingualText[@CompositionName='Comment']//Text"))
-    if not address:
-        found.skip(name, "the tag has no address")
-    elif kind.startswith('"'):
-        found.skip(name, "a PLC data type; name its members in the table")
-    else:
-        writable = _attribute(tag, "ExternalWritable").lower() == "true"
-        comment = next((text for text in texts if text.strip()), "")
-        found.add((name,), value_type(kind), address=address, comment=comment, writable=writable)
-
-
-def _add_block(found: Found, block: Element, prefix: tuple[str, ...]) -> None:
-    """Add the registers of a block, by compiling source text that declares its members."""
-    name, number = _attribute(block, "Name"), _attribute(block, "Number")
-    section = block.find("AttributeList/Interface/Sections/Section[@Name='Static']")
-    if section is None:
-        return found.skip(name, "the data block has no members")
-    lines = ["DATA_BLOCK DB1", "{ S7_Optimized_Access := 'FALSE' }", "STRUCT"]
-    lines += _members(found, section, prefix or (name,), 0)
-    lines += ["END_STRUCT;", "BEGIN", "END_DATA_BLOCK"]
+def _placed(
+    program: Program, name: str, type_bytes: Mapping[str, int]
+) -> tuple[Mapping[str, Register], list[Diagnostic]]:
+    """Return the registers of a block whose addresses are known, by path, and warnings."""
     try:
-        [layout] = compile_sources([Source(name, "\n".join(lines).encode())]).layouts
+        compiled = program.compile((name,), type_bytes)
     except LayoutError as error:
-        return found.skip(name, f"the data block cannot be placed: {error.diagnostics[0].message}")
-    standard = _attribute(block, "MemoryLayout") == "Standard"
-    if not standard:
+        return {}, [one for one in error.diagnostics if one.severity == "error"]
+    return {one.path: one for one in compiled.layouts[0].registers}, [*compiled.warnings]
+
+
+def _add_block(
+    found: Found, layout: Layout, addresses: Mapping[str, Register], prefix: tuple[str, ...], line: int
+) -> None:
+    name, number = layout.name, layout.number
+    if layout.optimized:
         found.remarks.append(
-            f"{name} has optimized access: its values have no addresses, and the column is empty; "
-            "read it by OPC UA, or switch off 'Optimized block access'"
+            f"{name} has optimized access: its values have no addresses, and the column is empty; read it by OPC UA "
+            "with nodes = \"siemens\", or switch off 'Optimized block access'"
         )
+    if number is None:
+        addresses = {}
     for register in layout.registers:
+        at = addresses.get(register.path)
+        names = prefix + tuple(map(decode_segment, register.path.split("/")))
+        if at is None and addresses:
+            found.skip(
+                "/".join(names),
+                "its address is unknown, because it depends on the size of a system type; give the size by "
+                "--type-bytes, or leave out all addresses by --by-name to read the block by OPC UA",
+                line,
+            )
+            continue
         address = ""
-        if standard and number.isdecimal() and len(number) <= 5:
-            address = in_block(int(number), register.offset, register.bit, register.element.size)
-        names = tuple(prefix) + tuple(_decoded(register))
-        found.add(names, _type(register), address=address, comment=register.comment, initial=register.initial)
-    return None
-
-
-def _decoded(register: Register) -> Iterator[str]:
-    yield from (decode_segment(segment) for segment in register.path.split("/"))
+        if at is not None and number is not None:
+            address = in_block(number, at.offset, at.bit, at.element.size)
+        columns = {"address": address, "comment": register.comment, "initial": _initial(found, register)}
+        found.add(names, _type(register), columns, line, of_s7 if address else None)
 
 
 def _type(register: Register) -> str:
@@ -90,36 +168,22 @@ def _type(register: Register) -> str:
     return f"ARRAY[{bounds}] OF {register.type}" if bounds else register.type
 
 
-def _members(found: Found, section: Element, path: tuple[str, ...], depth: int) -> Iterator[str]:
-    """Yield the lines that declare the members of a section or a structure."""
-    for member in section.iterfind("Member"):
-        name, kind = member.get("Name", ""), member.get("Datatype", "")
-        here = (*path, name)
-        if not name or '"' in name or not name.isprintable():
-            raise ImportingError(
-                f"{'/'.join(path)}: the member name {name!r} is not allowed in source text; rename the member"
-            )
-        array = _ARRAY.fullmatch(kind)
-        bounds, element = (f"ARRAY[{array[1]}] OF ", array[2]) if array else ("", kind)
-        inner = member if element.lower() == "struct" else member.find("Sections/Section[@Name='None']")
-        comment = " ".join((member.findtext("Comment/MultiLanguageText") or "").split())
-        tail = f"  // {comment}" if comment else ""
-        if (inner is not None and (element.lower() == "struct" or element.startswith('"'))) or (
-            inner is not None and not array and inner.find("Member") is not None
-        ):
-            yield f'"{name}" : {bounds}STRUCT{tail}'
-            yield from _members(found, inner, here, depth + 1)
-            yield "END_STRUCT;"
-            continue
-        if not _TYPE.fullmatch(element):
-            raise ImportingError(f"{'/'.join(here)}: the members of the type {kind} are not in the file")
-        start = " ".join((member.findtext("StartValue") or "").split())
-        given = f" := {start}" if start and not array and _is_plain(start) else ""
-        yield f'"{name}" : {bounds}{element}{given};{tail}'
-
-
-def _is_plain(start: str) -> bool:
-    """Return whether a start value is a literal and not the name of a constant."""
-    return (bool(re.fullmatch(r"'[^'$;]*'|[-+0-9A-Za-z#_.:]+", start)) and not start[0].isalpha()) or bool(
-        re.fullmatch(r"true|false|[A-Za-z0-9_]+#[-+0-9A-Za-z_.:#]+", start, re.IGNORECASE)
-    )
+def _initial(found: Found, register: Register) -> object:
+    """Return an initial value as a tag table has it; None if there is none, or if it cannot be read."""
+    if register.initial is None:
+        return None
+    try:
+        value = parse_literal(register.initial, register)
+    except ValueRangeError as error:
+        found.remarks.append(f"{register.path}: the initial value is left out: {error}")
+        return None
+    is_text = register.element.base in TEXTS
+    if not register.dims:
+        return value if is_text else register.initial
+    if register.count > _MAX_INITIAL:
+        found.remarks.append(f"{register.path}: the initial value is left out, because the array is large")
+        return None
+    items = [default_text(register.element)] * register.count
+    for start, count, item in split_array(register.initial, register.shape):
+        items[start : start + count] = [item] * count
+    return [scalar_literal(item, register.element) if is_text else item for item in items]

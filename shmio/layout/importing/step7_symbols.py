@@ -1,75 +1,92 @@
-"""Import symbol tables of STEP 7 classic.
+"""Import symbol tables of STEP 7 classic, and lists of the same columns, also of TIA Portal's tag editor.
 
-The formats are ``.sdf`` (quoted texts with commas), ``.asc`` (columns of fixed width) and ``.seq``
-(texts with tabs).
+The formats are ``.sdf`` (quoted texts with commas; 4 columns, or 9 from TIA Portal), ``.asc`` (columns
+of fixed width), ``.seq`` (texts with tabs), and rows ``symbol;address;type;comment``.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Final
 
+from shmio.layout.foreign import COLUMNS, FIXED, HEADINGS, MAX_PROBED, OPERAND, is_header
 from shmio.layout.importing.found import Found, ImportingError
-from shmio.layout.importing.s7_address import from_classic, value_type
-from shmio.layout.source.file import decode
+from shmio.layout.importing.plc_tag import CONSTANT, add_plc_tag
+from shmio.layout.rows import delimiter_of, rows
+from shmio.layout.s7.notation import from_classic
 
-FIRST: Final = "126,"
-"""Start of each line of an ``.asc`` file; columns of 24, 12, 10 and 80 characters follow."""
-_Symbol = tuple[str, str, str, str]
+_NOT_A_VALUE: Final = "the symbol is not that of an input, output, bit memory, timer or counter"
 
 
-def read(data: bytes) -> Found:
-    """Return the symbols that stand for values; raise ImportingError if the file is not a symbol table."""
-    text = decode(data).text
+def read(text: str) -> Found:
+    """Return the symbols that stand for values; raise ImportingError if the file is not such a list."""
     found = Found("a symbol table of STEP 7")
-    for line, (name, address, kind, comment) in _symbols(text):
+    if text.lstrip("\r\n").startswith(FIXED):
+        symbols = _fixed(found, text)
+    elif text.lstrip("\r\n").startswith("\t"):
+        symbols = _assignments(text)
+    else:
+        symbols = _separated(found, text)
+    for line, symbol in symbols:
+        name, address, kind = symbol["name"], symbol["address"], symbol["type"].strip('"')
         place = from_classic(address)
         if not name:
-            found.skip(f"line {line}", "the line has no symbol")
+            found.skip("a row", "the row has no symbol", line)
+        elif address.upper() == "CONSTANT":
+            found.skip(name, CONSTANT, line)
         elif place is None:
-            found.skip(name, "the symbol is not that of an input, output, bit memory, timer or counter")
+            found.skip(name, _NOT_A_VALUE if OPERAND.fullmatch(address) else f"{address!r} is not an address", line)
         else:
-            found.add((name,), value_type(kind or _type_of(place)), address=place, comment=comment)
+            writable = symbol.get("writable", "").lower() == "true"
+            add_plc_tag(found, name, kind or _type_of(place), place, line, comment=symbol["comment"], writable=writable)
     return found
 
 
-def _symbols(text: str) -> Iterator[tuple[int, _Symbol]]:
-    """Yield the number and the symbol of each line; raise ImportingError if a line has other columns."""
-    if text.startswith(FIRST):
-        for line, row in enumerate(text.splitlines(), 1):
-            if row.strip("\x1a\0 "):
-                if not row.startswith(FIRST):
-                    raise ImportingError(f"line {line}: expected {FIRST} at its start, as in all lines of an .asc file")
-                columns = row[len(FIRST) :]
-                yield line, _stripped(columns[:24], columns[24:36], columns[36:46], columns[46:])
-        return
-    if text.startswith("\t"):
-        for line, row in enumerate(text.splitlines(), 1):
-            cells = [*row.split("\t"), "", "", ""]
-            if row.strip():
-                yield line, _stripped(cells[2], cells[1], "", cells[3])
-        return
-    first = text.partition("\n")[0]
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;", key=first.count), skipinitialspace=True)
-    try:
-        for line, cells in enumerate(reader, 1):
-            if not any(cell.strip("\x1a\0 ") for cell in cells):
-                continue
-            if len(cells) != 4:
-                raise ImportingError(f"row {line}: expected symbol, address, type, comment; found {len(cells)} cells")
-            yield line, _stripped(*cells)
-    except csv.Error as error:
-        raise ImportingError(f"the file is not a symbol table: {error}") from None
+def _fixed(found: Found, text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    for line, row in enumerate(text.split("\n"), 1):
+        if not row.strip("\r\x1a\0 "):
+            continue
+        if not row.startswith(FIXED):
+            found.skip(row.strip(), f"the row does not begin with {FIXED}, as in an .asc file", line)
+            continue
+        columns = row.rstrip("\r")[len(FIXED) :]
+        cells = columns[:24], columns[24:36], columns[36:46], columns[46:]
+        yield line, dict(zip(COLUMNS[4], map(str.strip, cells), strict=True))
 
 
-def _stripped(name: str, address: str, kind: str, comment: str) -> _Symbol:
-    return name.strip(), address.strip(), kind.strip().strip('"'), comment.strip()
+def _assignments(text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the rows of an assignment list: nothing, address, symbol, comment."""
+    for line, row in enumerate(text.split("\n"), 1):
+        if row.strip("\r\x1a\0\t "):
+            _, address, name, comment = [*map(str.strip, row.split("\t", 3)), "", "", ""][:4]
+            yield line, {"name": name, "address": address, "type": "", "comment": comment}
+
+
+def _separated(found: Found, text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield rows whose cells a delimiter separates. The first row may be a header."""
+    first = next((line for line in text.split("\n") if line.strip()), "")
+    table = list(rows(text, delimiter_of(first)))
+    if table and is_header(table[0][1]):
+        columns: Sequence[str] = [HEADINGS.get(cell.lower(), "") for cell in table.pop(0)[1]]
+    else:
+        counts = Counter(len(cells) for _, cells in table[:MAX_PROBED] if len(cells) in COLUMNS)
+        if not counts:
+            raise ImportingError(
+                "expected rows of symbol, address, type and comment, or the nine columns of TIA Portal; found "
+                f"{len(table[0][1]) if table else 0} cells"
+            )
+        columns = COLUMNS[counts.most_common(1)[0][0]]
+    for line, cells in table:
+        if len(cells) != len(columns):
+            found.skip(cells[0], f"expected {len(columns)} cells, found {len(cells)}", line)
+        else:
+            yield line, {"type": "", "comment": ""} | dict(zip(columns, cells, strict=True))
 
 
 def _type_of(address: str) -> str:
-    """Return a type that fits an address; used because an assignment list (``.seq``) has no types."""
+    """Return a type that fits an address; used where a list has no types."""
     if address[1] in "TC":
         return "TIMER" if address[1] == "T" else "COUNTER"
-    return {"B": "BYTE", "W": "WORD", "D": "DWORD"}.get(address[2], "BOOL")
+    width = address.partition(".DB")[2] or address[2:]
+    return {"B": "BYTE", "W": "WORD", "D": "DWORD"}.get(width[0], "BOOL")

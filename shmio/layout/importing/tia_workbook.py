@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
+from shmio.layout.foreign import SHEET
 from shmio.layout.importing.found import Found, ImportingError
-from shmio.layout.importing.s7_address import value_type
+from shmio.layout.importing.plc_tag import add_plc_tag
 from shmio.layout.workbook import WorkbookError, read_rows
 
-SHEET: Final = "PLC Tags"
 _NEEDED: Final = ("name", "data type", "logical address")
 
 
@@ -28,17 +28,9 @@ def read(data: bytes) -> Found:
             place = header.get(column)
             return cells[place].strip() if place is not None and place < len(cells) else ""
 
-        name, kind, address = cell("name"), cell("data type"), cell("logical address")
         comment = cell("comment")
-        if not name:
-            found.skip(f"row {number}", "the row has no name")
-        elif not address:
-            found.skip(name, "the tag has no address")
-        elif kind.startswith('"'):
-            found.skip(name, "a PLC data type; name its members in the table")
-        else:
-            found.add(
-                (name,), value_type(kind), address=address, comment="" if comment == "<No Value>" else comment,
-                writable=cell("hmi writeable").lower() == "true",
-            )  # fmt: skip
+        add_plc_tag(
+            found, cell("name"), cell("data type"), cell("logical address"), number,
+            comment="" if comment == "<No Value>" else comment, writable=cell("hmi writeable").lower() == "true",
+        )  # fmt: skip
     return found

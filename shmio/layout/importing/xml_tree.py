@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final, cast
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
@@ -12,14 +13,32 @@ MAX_ELEMENTS: Final = 500_000
 MAX_DEPTH: Final = 200
 
 
-def parse(data: bytes) -> Element:
+class Node(Element):
+    """An element, and the line of the file on which it begins."""
+
+    line = 0
+
+    if TYPE_CHECKING:  # the elements of a tree of nodes are nodes; typeshed knows only Element
+
+        def __iter__(self) -> Iterator[Node]: ...
+        def iter(self, tag: str | None = None) -> Iterator[Node]:  # type: ignore[override]
+            """Yield this node and the nodes below it with this tag, or all."""
+
+        def iterfind(self, path: str, namespaces: Any = None) -> Iterator[Node]:  # type: ignore[override]
+            """Yield the nodes at a path."""
+
+        def find(self, path: str, namespaces: Any = None) -> Node | None:
+            """Return the first node at a path."""
+
+
+def parse(data: bytes) -> Node:
     """Return the root element. Element names in the tree have no namespaces.
 
     Raises:
         ImportingError: The data is not XML, has a document type, or is too large or too deep.
 
     """
-    builder = TreeBuilder()
+    builder = TreeBuilder(Node)
     parser = expat.ParserCreate(namespace_separator="}")
     parser.buffer_text = True
     depth = elements = 0
@@ -31,7 +50,9 @@ def parse(data: bytes) -> Element:
             raise ImportingError(
                 f"the XML has more than {MAX_ELEMENTS} elements, or is nested more than {MAX_DEPTH} deep"
             )
-        builder.start(name.rpartition("}")[2], {key.rpartition("}")[2]: value for key, value in attributes.items()})
+        named = {key.rpartition("}")[2]: value for key, value in attributes.items()}
+        node = cast("Node", builder.start(name.rpartition("}")[2], named))
+        node.line = parser.CurrentLineNumber
 
     def end(name: str) -> None:
         nonlocal depth
@@ -50,6 +71,6 @@ def parse(data: bytes) -> Element:
     parser.EntityDeclHandler = refuse
     try:
         parser.Parse(data, True)
-        return builder.close()
+        return cast("Node", builder.close())
     except (expat.ExpatError, ValueError, LookupError, AssertionError) as error:
         raise ImportingError(f"the file is not valid XML: {error}") from None

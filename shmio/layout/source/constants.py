@@ -98,7 +98,10 @@ def _factor(at: Cursor, what: str) -> int | Constant:
         return Constant(token.text, position)
     at.accept("#")  # marks a name as local
     if at.token.kind in (Kind.WORD, Kind.QUOTED):
-        return Constant(at.advance().text, position)
+        name = at.advance().text
+        if name == "_" and at.accept(".") and at.token.kind in (Kind.WORD, Kind.QUOTED):  # SIMATIC SD
+            name = at.advance().text
+        return Constant(name, position)
     return _number(at, what)
 
 

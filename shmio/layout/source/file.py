@@ -1,8 +1,8 @@
-"""Decode the bytes of a source file, and recognise files that are not sources.
+"""Decode the bytes of a source file.
 
 TIA Portal writes UTF-8 with a byte order mark, STEP 7 classic uses the Windows code page of its PC,
-and some editors write UTF-16 with a mark. Files without a mark are read as UTF-8 or, if they are
-not in UTF-8, as Windows-1252.
+and some editors write UTF-16 with a mark. Files without a mark are read in the encoding that the user
+names. If the user names none, they are read as UTF-8 or, if they are not in UTF-8, as Windows-1252.
 """
 
 from __future__ import annotations
@@ -12,28 +12,24 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-HEAD_BYTES: Final = 4096
+from shmio.layout.encodings import codec
+
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
+_HIGH: Final = re.compile(rb"[\x80-\xff]+")
 _NEWLINE = re.compile(r"\r\n|\r|\n")
 _AS_WINDOWS = (
-    "the file is not UTF-8, so shmio reads it as Windows-1252, and letters with accents may be wrong in names and "
-    "comments; save it as UTF-8 to be sure"
+    "the file is not UTF-8, so shmio reads it as Windows-1252, which is not sure: letters with accents and of "
+    'other scripts may be wrong in names and comments; name the encoding (encoding = "gbk", --encoding gbk), or '
+    "save it as UTF-8"
 )
-_INSTEAD: Final = (
-    "in TIA Portal, open the context menu of the data block, choose 'Generate source from blocks', and name the "
-    ".db file that it writes"
+EASTERN: Final = (
+    "the file is not UTF-8, and looks like Chinese or Korean text in GBK or CP949; name its encoding, such as "
+    'encoding = "gbk" in the configuration or --encoding gbk of shmio-layout, or save it as UTF-8'
 )
-_CONVERT: Final = "'shmio-layout import' makes a tag table of it; for a data block, "
-_ZIP: Final = b"PK\x03\x04"
-_OLD_OFFICE: Final = b"\xd0\xcf\x11\xe0"
-_CONTROLS: Final = bytes({*range(32)} - {*b"\t\n\f\r"})
-_MARKUP: Final = re.compile(r"\s*<[?!A-Za-z]")
-_SOURCE: Final = re.compile(r"\b(?:DATA_BLOCK|END_TYPE|FUNCTION_BLOCK|END_VAR)\b", re.IGNORECASE)
-_SEPARATORS: Final = re.compile(r"[;,\t]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +37,8 @@ class Decoded:
     """The text of a source.
 
     ``problem`` is a warning (an error if ``fatal``) about the bytes at ``line`` and ``column``;
-    empty if there is none.
+    empty if there is none. ``eastern`` is true if the bytes are almost surely Chinese or Korean text,
+    which was decoded as Windows-1252.
     """
 
     text: str
@@ -49,16 +46,27 @@ class Decoded:
     line: int = 1
     column: int = 1
     fatal: bool = False
+    eastern: bool = False
 
 
-def decode(data: bytes) -> Decoded:
-    """Decode a source: by its byte order mark, or else as UTF-8, or else as Windows-1252."""
-    mark, encoding = next(((mark, name) for mark, name in _MARKS if data.startswith(mark)), (b"", "utf-8"))
+def decode(data: bytes, encoding: str = "") -> Decoded:
+    """Decode a source: by its byte order mark, or else as ``encoding``.
+
+    If ``encoding`` is empty, decode the source as UTF-8, or else as Windows-1252. Otherwise it is the
+    name of one of :data:`shmio.layout.encodings.ENCODINGS`.
+    """
+    given = encoding
+    mark, encoding = next(
+        ((mark, name) for mark, name in _MARKS if data.startswith(mark)), (b"", codec(given) if given else "utf-8")
+    )
     data = data[len(mark) :]
     try:
         return Decoded(data.decode(encoding))
     except UnicodeDecodeError as error:
-        line, column = _place(data[: error.start].decode(encoding))
+        line, column = _place(data[: error.start].decode(encoding, "replace"))
+    if given and not mark:
+        problem = f"the bytes here are not {given}; name the encoding in which the file was saved"
+        return Decoded("", problem, line, column, fatal=True)
     if encoding != "utf-8":
         problem = f"the file has the byte order mark of {encoding.upper()}, but other bytes follow; "
         return Decoded("", f"{problem}export the source again", line, column, fatal=True)
@@ -66,36 +74,20 @@ def decode(data: bytes) -> Decoded:
         text = data.decode("cp1252")
     except UnicodeDecodeError:
         text = data.decode("latin-1")  # because five bytes have no character in Windows-1252
-    return Decoded(text, _AS_WINDOWS, line, column)
+    return Decoded(text, _AS_WINDOWS, line, column, eastern=_is_eastern(data))
+
+
+def _is_eastern(data: bytes) -> bool:
+    """Return whether all bytes above 7F are pairs of GBK or EUC-KR, most of them of the common characters.
+
+    A letter with an accent in the text of a Western code page stands alone or beside one other.
+    """
+    runs = _HIGH.findall(data)
+    pairs = [run[at : at + 2] for run in runs for at in range(0, len(run), 2)]
+    common = sum(0xB0 <= pair[0] <= 0xD7 and pair[-1] >= 0xA1 for pair in pairs)
+    return len(pairs) > 1 and all(len(run) % 2 == 0 for run in runs) and common * 5 >= len(pairs) * 4
 
 
 def _place(before: str) -> tuple[int, int]:
     lines = _NEWLINE.split(before)
     return len(lines), len(lines[-1]) + 1
-
-
-def foreign(file: str, data: bytes) -> str:
-    """Return a message that names the kind of a file and the remedy; "" if the file may be a source."""
-    name = file.lower()
-    head = data[:HEAD_BYTES]
-    if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):
-        return f"this is a spreadsheet or an archive, which shmio cannot read; {_INSTEAD}"
-    wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
-    text = decode(head[: len(head) & ~1] if wide else head).text
-    if _MARKUP.match(text) or name.endswith(".xml"):
-        return f"this is XML, as TIA Portal Openness exports blocks; {_CONVERT}{_INSTEAD}"
-    if name.endswith((".csv", ".sdf", ".tsv")) or _is_table(text, data):
-        return f"this is a table of tags without their places in a data block; {_CONVERT}{_INSTEAD}"
-    controls = len(head) - len(head.translate(None, _CONTROLS))
-    if not wide and controls > max(len(head) // 20, 8):
-        return f"this is not a text file; {_INSTEAD}"
-    return ""
-
-
-def _is_table(text: str, data: bytes) -> bool:
-    """Return whether the text looks like a table of separated values and declares no block."""
-    lines = [line for line in text.splitlines() if line.strip()][:3]
-    if len(lines) < 2 or ":" in lines[0] or _SOURCE.search(decode(data).text):
-        return False
-    counts = [len(_SEPARATORS.findall(line)) for line in lines]
-    return counts[0] >= 2 and len({*counts[:2]}) == 1

@@ -126,7 +126,8 @@ def tokenize(text: str) -> list[Token]:
                     stop = end + len(close)
             elif kind := _KINDS.get(group):
                 content = match["name"] if kind is Kind.QUOTED else match[0]
-                fault = _problem(kind, content)
+                is_value = bool(tokens) and tokens[-1].is_punct(":=")  # an attribute of SIMATIC SD may be ""
+                fault = "" if kind is Kind.QUOTED and not content and is_value else _problem(kind, content)
                 if kind is Kind.PUNCT and content in "'\"":
                     end_of_line = _NEWLINE.search(text, stop)
                     stop = end_of_line.start() if end_of_line else len(text)
@@ -183,6 +184,8 @@ class Cursor:
     def __init__(self, file: str, text: str, tokens: list[Token], report: Report) -> None:
         self.file = file
         self.report = report
+        self.attributes_first = False
+        """True if attributes precede what they are about, as in SIMATIC SD; False if they follow its name."""
         self._text = text
         self._tokens = tokens
         self._absent: set[str] = set()  # keywords that do not occur again; do not search them twice
@@ -276,7 +279,8 @@ class Cursor:
     def names_member(self) -> bool:
         """Return whether the current word is a member's name and not a keyword; the next token shows this."""
         following = self._tokens[min(self.index + 1, len(self._tokens) - 1)]
-        return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
+        valid = (":", ",") if self.attributes_first else (":", "{", ",")
+        return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in valid
 
     def words(self) -> str:
         """Step over the words and numbers on this line, and return them as one name with spaces.

@@ -1,5 +1,9 @@
 """Parse tokens into declarations by recursive descent: files, blocks, assignments after BEGIN.
 
+Sources have one of two forms. In SIMATIC SD (``.s7dcl``, TIA Portal V20 and later), attributes precede
+a block, a type's name follows the keyword TYPE, assignments follow the sections without BEGIN, and
+``_.`` precedes a name of the whole program.
+
 After a syntax error the parser continues at the next ``;`` or ``END_…``, so that one run finds all
 errors.
 """
@@ -14,11 +18,12 @@ from dataclasses import dataclass, replace
 from shmio.layout.model import MAX_DEPTH
 from shmio.layout.report import MAX_ERRORS, Report, TooManyErrors
 from shmio.layout.source.constants import bound, bounds, integer, string_length
-from shmio.layout.source.lexer import Cursor, Kind, SyntaxFault, Token
+from shmio.layout.source.lexer import Cursor, Kind, SyntaxFault, Token, tokenize
 from shmio.layout.source.syntax import (
     Array,
     Assignment,
     BlockDeclaration,
+    Bound,
     ConstantDeclaration,
     Member,
     Named,
@@ -47,13 +52,48 @@ _PROTECTED = (
     "{!r} is know-how protected and its declaration is not in the source; remove the protection in its "
     "properties and export it again, or write its members here"
 )
+SD_SUFFIX = ".s7dcl"
 _SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
+_MAX_NUMBER = 65_535
 _PLAIN = re.compile(r"\w+")
 
 
 def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
     """Parse one file. Report errors, and leave wrong declarations out of the result."""
-    return _Parser(Cursor(file, text, tokens, report)).unit()
+    sd = file.lower().endswith(SD_SUFFIX) or tokens[0].is_punct("{")
+    sd = sd or (tokens[0].is_word("TYPE") and len(tokens) > 2 and tokens[2].is_punct(":"))
+    return _Parser(Cursor(file, text, tokens, report), sd=sd).unit()
+
+
+def parse_type(position: Position, text: str, report: Report) -> Type | None:
+    """Parse the name of a type, such as ``Array[0..9] of Int``; report an error and return None if it is wrong."""
+    at = _cursor(position, text, report)
+    try:
+        found = _Declarations(at).body_type()
+        if not at.at_end():
+            raise at.expected("a type")
+    except SyntaxFault as fault:
+        report.add(fault.diagnostic)
+        return None
+    return found
+
+
+def parse_number(position: Position, text: str) -> Bound | None:
+    """Parse the value of a constant as a bound; return None if it cannot be one."""
+    at = _cursor(position, text, Report([position.file]))
+    try:
+        found = bound(at, "a number")
+    except SyntaxFault:
+        return None
+    return found if at.at_end() else None
+
+
+def _cursor(position: Position, text: str, report: Report) -> Cursor:
+    """Return a cursor over text that is all at one place of a file."""
+    tokens = tokenize(text)
+    for token in tokens:
+        token.line, token.column = position.line, position.column
+    return Cursor(position.file, text, tokens, report)
 
 
 class _Declarations:
@@ -109,6 +149,8 @@ class _Declarations:
     def _constant(self, constants: list[ConstantDeclaration]) -> None:
         if self.at.accept(";"):
             return
+        if self.at.token.is_punct("{"):
+            self.attributes()
         name, position, _ = self._name()
         if self.at.token.is_punct("{"):
             self.attributes()
@@ -171,6 +213,8 @@ class _Declarations:
     def _member(self, members: list[Member], depth: int) -> None:
         if self.at.accept(";"):
             return
+        if self.at.token.is_punct("{"):  # SIMATIC SD has the attributes first
+            self.attributes()
         names = [self._name()]
         while self.at.accept(","):
             names.append(self._name())
@@ -230,8 +274,7 @@ class _Declarations:
                 raise self.at.fault(token, "expected at least one member in the structure")
             return Struct(members, position)
         if token.kind is Kind.QUOTED:
-            self.at.advance()
-            return Named(token.text, True, position)
+            return Named(self.dotted(), True, position)
         if token.kind is not Kind.WORD or token.is_word(*_STOPS, *_SECTIONS):
             raise self.at.expected("a type")
         self.at.advance()
@@ -239,7 +282,22 @@ class _Declarations:
             return Named(token.text.upper(), False, position, string_length(self.at, token.text.upper()))
         if token.is_word(*_NUMBERED_TYPES) and self.at.token.kind is Kind.NUMBER:
             return Named(token.text + self.at.advance().text, False, position)  # UDT 10 is UDT10
+        if self.at.token.is_punct("."):
+            return Named(self.dotted(token), True, position)
         return Named(token.text, False, position)
+
+    def dotted(self, first: Token | None = None) -> str:
+        """Read a name that may have the name of a software unit before it: ``"Tools"."Axis"``, ``_.Axis``.
+
+        ``first`` is the first name if it has been read already. In the result, a unit precedes a
+        point; ``_``, which stands for the program outside of units, is left out.
+        """
+        parts = [(first or self.at.advance()).text]
+        while self.at.accept("."):
+            if self.at.token.kind not in (Kind.WORD, Kind.QUOTED):
+                raise self.at.expected("a name")
+            parts.append(self.at.advance().text)
+        return ".".join(parts[1:] if parts[0] == "_" and len(parts) > 1 else parts)
 
 
 @dataclass(slots=True)
@@ -248,21 +306,40 @@ class _Header:
 
     optimized: bool = False
     protected: bool = False
+    number: int | None = None
 
 
 class _Parser:
-    def __init__(self, cursor: Cursor) -> None:
+    def __init__(self, cursor: Cursor, *, sd: bool) -> None:
         self.at = cursor
         self.declare = _Declarations(cursor)
+        self._sd = cursor.attributes_first = sd
+        self._before: _Header | None = None  # the attributes before a block
+
+    def attributes_before(self) -> None:
+        """Read the attributes that SIMATIC SD has before a block."""
+        found = self.declare.attributes()
+        number = found.get("S7_BLOCKNUMBER", "")
+        self._before = _Header(
+            optimized=found.get("S7_OPTIMIZED", "TRUE").upper() == "TRUE",
+            number=int(number) if number.isdecimal() and len(number) <= 5 and 0 < int(number) <= _MAX_NUMBER else None,
+        )
+
+    def take_before(self) -> _Header:
+        """Return the attributes before the current block. A block of SIMATIC SD that has none is optimized."""
+        before, self._before = self._before, None
+        return before or _Header(optimized=self._sd)
 
     def unit(self) -> Unit:
         unit = Unit()
         while not self.at.at_end():
             try:
-                if self.at.accept_word("DATA_BLOCK"):
+                if self.at.token.is_punct("{"):
+                    self.attributes_before()
+                elif self.at.accept_word("DATA_BLOCK"):
                     unit.blocks.append(self.block())
                 elif self.at.accept_word("TYPE"):
-                    unit.types.append(self.type_declaration())
+                    unit.types += self.type_declarations()
                 elif self.at.accept_word("FUNCTION_BLOCK"):
                     unit.types.append(self.function_block())
                 elif self.at.token.is_word("FUNCTION", "ORGANIZATION_BLOCK"):
@@ -278,9 +355,16 @@ class _Parser:
         return unit
 
     def resume(self) -> None:
-        """Go to the beginning of the next declaration."""
+        """Go to the beginning of the next declaration, or of the attributes before it."""
+        opening = closing = -1
         while not self.at.at_end() and not self.at.token.is_word(*_TOP):
+            if self.at.token.is_punct("{"):
+                opening = self.at.index
+            elif self.at.token.is_punct("}"):
+                closing = self.at.index
             self.at.advance()
+        if self._sd and 0 <= opening < closing == self.at.index - 1:
+            self.at.rewind(opening)
 
     @contextmanager
     def collecting(self, *, resume: bool = True) -> Iterator[Report]:
@@ -305,27 +389,54 @@ class _Parser:
         position = self.at.position
         name, quoted = self.block_name("the block's name")
         match = None if quoted else _DB_NUMBER.fullmatch(name)
-        number = int(match[1]) if match and int(match[1]) <= 65_535 else None
-        header = _Header()
+        header = self.take_before()
+        number = header.number or (int(match[1]) if match and int(match[1]) <= _MAX_NUMBER else None)
         body: Type = Struct((), position)
         constants: tuple[ConstantDeclaration, ...] = ()
         assignments: list[Assignment] = []
         with self.collecting() as found:
-            header = self.header()
+            header = self.header(header)
             if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
                 raise SyntaxFault(position.error(_PROTECTED.format(name)))
-            if self.at.token.is_word("STRUCT", *_BLOCK_SECTIONS):
+            if self._sd and self.at.accept(":"):
+                body = self.declare.body_type()
+            elif self._sd or self.at.token.is_word("STRUCT", *_BLOCK_SECTIONS):
                 body, constants = self.declare.sections()
             else:
                 body = self.declare.body_type()
                 header = self.header(header)  # STEP 7 allows it before and after the type's name
             self.at.accept(";")
-            if self.at.accept_word("BEGIN"):
+            if self.at.accept_word("BEGIN") or self._sd:
                 while not self.at.token.is_word("END_DATA_BLOCK", *_TOP) and self.at.token.kind is not Kind.END:
                     self.declare.recovering(lambda: self.assignment(assignments))
             self.at.expect_word("END_DATA_BLOCK")
         faults = (*found.errors, *found.warnings)
         return BlockDeclaration(name, number, header.optimized, body, constants, tuple(assignments), position, faults)
+
+    def type_declarations(self) -> list[TypeDeclaration]:
+        """Read what follows the keyword TYPE: one type, or in SIMATIC SD several, each with a colon after its name."""
+        if not self._sd:
+            return [self.type_declaration()]
+        self.take_before()
+        found: list[TypeDeclaration] = []
+        while not self.at.accept_word("END_TYPE"):
+            if self.at.at_end() or self.at.token.is_word(*_TOP):
+                raise self.at.expected("a type or END_TYPE")
+            if self.at.token.is_punct("{"):
+                self.declare.attributes()
+            position = self.at.position
+            name, _ = self.block_name("the type's name")
+            body = Struct((), position)
+            with self.collecting() as report:
+                self.at.expect(":", "':' after the type's name")
+                if not self.at.token.is_word("STRUCT"):
+                    raise self.at.expected("STRUCT")
+                body, _ = self.declare.sections()
+                self.at.accept(";")
+            found.append(TypeDeclaration(name, body, position, faults=(*report.errors, *report.warnings)))
+            if report.errors and (self.at.at_end() or self.at.token.is_word(*_TOP)):
+                break
+        return found
 
     def type_declaration(self) -> TypeDeclaration:
         position = self.at.position
@@ -348,15 +459,15 @@ class _Parser:
         """Read the interface of a function block; skip its code."""
         position = self.at.position
         name, _ = self.block_name("the function block's name")
-        body, header = Struct((), position), _Header()
+        body, header = Struct((), position), self.take_before()
         constants: tuple[ConstantDeclaration, ...] = ()
         self.declare.interface = True
         with self.collecting(resume=False) as found:
-            header = self.header()
+            header = self.header(header)
             if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
                 raise SyntaxFault(position.error(_PROTECTED.format(name)))
             body, constants = self.declare.sections()
-            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins like this
+            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;{":  # no statement begins like this
                 raise self.at.expected("a section of variables or BEGIN")
         self.declare.interface = False
         if not self.at.skip_to("END_FUNCTION_BLOCK"):
@@ -365,6 +476,7 @@ class _Parser:
         return TypeDeclaration(name, body, position, constants, True, header.optimized, tuple(found.errors))
 
     def code_block(self) -> None:
+        self.take_before()
         start = self.at.advance()
         end, name = f"END_{start.text.upper()}", self.at.token.text
         if not self.at.skip_to(end):
@@ -376,8 +488,7 @@ class _Parser:
         token = self.at.token
         if token.kind not in (Kind.WORD, Kind.QUOTED):
             raise self.at.expected(what)
-        self.at.advance()
-        name = token.text
+        name = self.declare.dotted()
         if token.is_word(*_NUMBERED) and self.at.token.kind is Kind.NUMBER:
             name += self.at.advance().text  # DB 10 is DB10
         return name, token.kind is Kind.QUOTED
@@ -401,6 +512,8 @@ class _Parser:
     def assignment(self, assignments: list[Assignment]) -> None:
         if self.at.accept(";"):
             return
+        if self.at.token.is_punct("{"):
+            self.declare.attributes()
         position = self.at.position
         target: list[str | tuple[int, ...]] = []
         while True:
@@ -422,4 +535,6 @@ class _Parser:
         self.at.expect(":=", "':=' and a value")
         value = self.at.value()
         self.at.expect(";", "';' after the value")
+        if value == "()":  # SIMATIC SD: no value of its own
+            return
         assignments.append(Assignment(tuple(target), value, position))

@@ -16,7 +16,7 @@ size.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 from shmio.layout.report import Report
@@ -60,6 +60,18 @@ _COUNTERS = (
 )
 _TIMERS = ("SFB3", "TP", "SFB4", "TON", "SFB5", "TOF")
 
+_IEC_TIMERS = (
+    "IEC_TIMER",
+    "TON_TIME",
+    "TOF_TIME",
+    "TP_TIME",
+    "TONR_TIME",
+)
+_IEC_LTIMERS = ("IEC_LTIMER", "TON_LTIME", "TOF_LTIME", "TP_LTIME", "TONR_LTIME")
+_IEC_COUNTERS = {
+    "SINT": "IEC_SCOUNTER", "USINT": "IEC_USCOUNTER", "INT": "IEC_COUNTER", "UINT": "IEC_UCOUNTER",
+    "DINT": "IEC_DCOUNTER", "UDINT": "IEC_UDCOUNTER", "LINT": "IEC_LCOUNTER", "ULINT": "IEC_ULCOUNTER",
+}  # fmt: skip
 _NO_SOURCE = "its placement in a block with standard access has no public source"
 _LENGTHS = {
     "IEC_TIMER": 16, "IEC_LTIMER": 32, "IEC_SCOUNTER": 3, "IEC_USCOUNTER": 3, "IEC_COUNTER": 6, "IEC_UCOUNTER": 6,
@@ -88,11 +100,30 @@ _REFUSED = {
 
 
 @cache
+def named() -> Mapping[str, TypeDeclaration]:
+    """Return the types whose members have known names but unknown places, by name in lower case.
+
+    Programs name these members: ``"x".PT``, ``"x".CV``. So a server has them as nodes.
+    """
+    texts = [f"TYPE {name} STRUCT PT, ET : Time; IN, Q : Bool; END_STRUCT END_TYPE" for name in _IEC_TIMERS]
+    texts += [f"TYPE {name} STRUCT PT, ET : LTime; IN, Q : Bool; END_STRUCT END_TYPE" for name in _IEC_LTIMERS]
+    for kind, counter in _IEC_COUNTERS.items():
+        members = f"STRUCT CU, CD, R, LD, QU, QD : Bool; PV, CV : {kind}; END_STRUCT END_TYPE"
+        texts += (f"TYPE {name} {members}" for name in (counter, f"CTU_{kind}", f"CTD_{kind}", f"CTUD_{kind}"))
+    texts += (f"TYPE {name} STRUCT CLK, Q : Bool; END_STRUCT END_TYPE" for name in ("R_TRIG", "F_TRIG"))
+    return _parsed(texts)
+
+
+@cache
 def declarations() -> Mapping[str, TypeDeclaration]:
     """Return the system types whose members are known, by name in lower case."""
     texts = [_TYPES, *(_TIMER.format(name=name) for name in _TIMERS)]
     for names, inputs, outputs, edges in _COUNTERS:
         texts += (_COUNTER.format(name=name, inputs=inputs, outputs=outputs, edges=edges) for name in names)
+    return _parsed(texts)
+
+
+def _parsed(texts: Sequence[str]) -> Mapping[str, TypeDeclaration]:
     text, report = "\n".join(texts), Report(["system types"])
     unit = parser.parse("system types", text, lexer.tokenize(text), report)
     return {declaration.name.lower(): declaration for declaration in unit.types}

@@ -401,7 +401,7 @@ def test_init_refuses_xml_with_a_remedy(name: str, capsys: pytest.CaptureFixture
     Path("good.db").write_text(block("DB1", "Int"))
     assert main(["init", name, "good.db"]) == 1
     error = capsys.readouterr().err
-    assert "this is XML, as TIA Portal Openness exports blocks" in error
+    assert "this is XML, not the source of a data block" in error
     assert error.count("\n") == 1
 
 

@@ -498,7 +498,7 @@ def test_the_size_of_any_other_type_can_be_declared() -> None:
     given = 'TYPE "Axis" STRUCT x : Nope; END_STRUCT; END_TYPE '
     sources = [Source("x.db", (given + text).encode())]
     sizes = {"ton_time": 16, "My FB": 7, "Axis": 10, "Other": 4}
-    with pytest.raises(LayoutError, match="TON_TIME"):
+    with pytest.raises(LayoutError, match="'My FB'"):
         compile_sources(sources, blocks=["b"])
     compiled = compile_sources(sources, blocks=["b"], type_bytes=sizes)
     assert places(compiled.layouts[0]) == {

@@ -88,7 +88,6 @@ def test_model_declares_its_registers(folder: Path) -> None:
         "seed": 4,
         "connections": {},
         "folder": str(folder),
-        "strict": False,
     }
 
 

@@ -1,4 +1,4 @@
-"""Convert absolute addresses of S7 controllers from STEP 7 classic's notation to TIA Portal's."""
+"""Absolute addresses of S7 controllers in the notation of TIA Portal, and of STEP 7 classic."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import re
 from typing import Final
 
 _ENGLISH: Final = {"E": "I", "A": "Q", "Z": "C"}
-_CLASSIC: Final = re.compile(r"(P?)([EAIQM])([BWD]?) ?([0-9]{1,5})(?:\.([0-7]))?|([TCZ]) ?([0-9]{1,5})")
+_CLASSIC: Final = re.compile(r"(P?)([EAIQM])([BWD]?) ?([0-9]{1,5})(?:\.([0-7]))?(:P)?|([TCZ]) ?([0-9]{1,5})")
 _IN_A_BLOCK: Final = re.compile(r"DB ?([0-9]{1,5})\.DB([XBWD]) ?([0-9]{1,5})(?:\.([0-7]))?")
 
 
 def from_classic(address: str) -> str | None:
-    """Return an address in TIA Portal's notation: ``%IW64`` for ``IW 64`` or ``EW 64``.
+    """Return an address in TIA Portal's notation: ``%IW64`` for ``IW 64``, ``EW 64`` or ``%IW64``.
 
     Peripheral inputs and outputs, such as ``PIW 256``, become ``%IW256:P``. Return None if the text
     is not the address of a value.
     """
-    text = " ".join(address.upper().split())
+    text = " ".join(address.upper().split()).removeprefix("%")
     if match := _IN_A_BLOCK.fullmatch(text):
         number, width, byte, bit = match.groups()
         return (
@@ -26,10 +26,11 @@ def from_classic(address: str) -> str | None:
         )
     if (match := _CLASSIC.fullmatch(text)) is None:
         return None
-    peripheral, area, width, byte, bit, counter, number = match.groups()
+    before, area, width, byte, bit, after, counter, number = match.groups()
+    peripheral = before or after
     if counter:
         return f"%{_ENGLISH.get(counter, counter)}{number}"
-    if (bit is None) != bool(width) or (peripheral and (bit is not None or area == "M")):
+    if (bit is None) != bool(width) or (peripheral and area == "M") or (before and (after or bit is not None)):
         return None
     return f"%{_ENGLISH.get(area, area)}{width}{byte}{'' if bit is None else f'.{bit}'}{':P' if peripheral else ''}"
 
