@@ -23,6 +23,8 @@ An emulator with ``faults = true`` has its own socket in the same folder, which 
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
 import select
 import selectors
@@ -49,6 +51,8 @@ TURN_S: Final = 0.5
 """Interval in s at which a waiting client checks whether the supervisor is alive."""
 CONNECT_S: Final = 0.05
 """Interval in s at which a client tries again to connect while the supervisor has too many clients."""
+_EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+_log = logging.getLogger("shmio")
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
@@ -240,6 +244,8 @@ class ControlServer:
         self._denied = denied
         self._requests = requests
         self._clients: dict[socket.socket, tuple[bytearray, float | None]] = {}
+        self._resting = False
+        """True from when a client could not be accepted until the next :meth:`expire`."""
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             remove_socket(path)
@@ -255,7 +261,11 @@ class ControlServer:
     def _accept(self) -> None:
         try:
             client, _ = self._listener.accept()
-        except OSError:  # the client has gone, or no descriptor is free
+        except OSError as error:
+            if error.errno in _EXHAUSTED:  # the client waits on, so the selector would report it without end
+                _log.error("the control socket accepts nobody now: %s", error.strerror)
+                self._selector.unregister(self._listener)
+                self._resting = True
             return
         client.setblocking(False)
         peer = _peer(client)
@@ -324,7 +334,10 @@ class ControlServer:
             self._drop(client)
 
     def expire(self) -> None:
-        """Disconnect clients that have not sent their request within ``REQUEST_S``."""
+        """Disconnect clients that have sent no request within ``REQUEST_S``. Accept clients again after a failure."""
+        if self._resting:
+            self._resting = False
+            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         now = time.monotonic()
         for client, (_, deadline) in list(self._clients.items()):
             if deadline is not None and now > deadline:
@@ -342,7 +355,9 @@ class ControlServer:
         """
         if self._listener.fileno() < 0:
             return
-        self._selector.unregister(self._listener)
+        if not self._resting:
+            self._selector.unregister(self._listener)
+        self._resting = False
         with suppress(OSError):
             if os.lstat(self._path).st_ino == self._inode:  # not the socket of a successor
                 remove_socket(self._path)

@@ -199,14 +199,12 @@ def with_fields(message: str, fields: Mapping[str, object]) -> str:
     return " ".join([message, *(f"{key}={value}" for key, value in fields.items())])
 
 
-def log_loop_errors() -> None:
-    """Have the running event loop log errors of the operating system in one line, without a traceback.
+def log_loop_errors(loop: asyncio.AbstractEventLoop) -> None:
+    """Have an event loop log errors of the operating system in one line, without a traceback.
 
     If no descriptor is free, for example, asyncio accepts no connection for a second, and then tries again.
     """
-    import asyncio  # noqa: PLC0415  programs without an event loop start faster
-
-    asyncio.get_running_loop().set_exception_handler(_log_loop_error)
+    loop.set_exception_handler(_log_loop_error)
 
 
 def _log_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

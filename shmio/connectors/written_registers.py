@@ -6,9 +6,9 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.write import Write, apply, bits_of
+from shmio.layout.values.write import Write, apply, bits_of, element_bits
 
 
 def written_registers(layout: Layout, write: Write, present: Callable[[int], Value]) -> Iterator[tuple[int, Value]]:
@@ -63,10 +63,7 @@ def _whole_elements(register: Register, share: bytes) -> bool:
     if not register.dims:
         return False
     if register.type == "BOOL":
-        own = bytearray(len(share))
-        for at, bit in bit_positions(register):
-            own[at] |= 1 << bit
-        return any(a & b for a, b in zip(own, share, strict=True))
+        return any(a & b for a, b in zip(element_bits(register), share, strict=True))
     size, stride = register.element.size, register.element.stride
     parts = (share[place * stride : place * stride + size] for place in range(register.count))
     return all(part in (bytes(size), b"\xff" * size) for part in parts)

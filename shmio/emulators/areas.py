@@ -11,6 +11,7 @@ from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area, is_of_cpu, parse
 from shmio.layout.s7.conversion import Conversion
+from shmio.layout.values.write import apply
 
 Place = tuple[Area, int]
 """An area, and the number of the data block; 0 for other areas."""
@@ -121,9 +122,5 @@ def _store(one: Conversion, frame: bytearray, memory: Mapping[Place, bytearray])
     """
     register, area = one.register, memory[_place(one)]
     own = bytes(frame[register.offset : register.offset + register.size])
-    if one.address.bit is not None:
-        mask = 1 << one.address.bit
-        area[one.start] = area[one.start] & ~mask | (mask if own[0] >> (register.bit or 0) & 1 else 0)
-        return
-    at, data = (0, own) if register.type == "BOOL" else one.device_bytes(own, 0, register.count)
-    area[one.start + at : one.start + at + len(data)] = data
+    for write in list(one.device_writes(own, b"\xff" * register.size)):
+        apply(write._replace(offset=one.start + write.offset), area)

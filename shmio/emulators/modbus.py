@@ -37,7 +37,8 @@ LEAST: Final = 100
 """Minimum number of entries in each table of a unit."""
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS = 1, 2
 _READS: Final = {1: Table.COIL, 2: Table.DISCRETE, 3: Table.HOLDING, 4: Table.INPUT}
-_TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, 22, 23), Table.HOLDING)
+MASK_WORD: Final = 22
+_TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, MASK_WORD, 23), Table.HOLDING)
 """The table that each function code reads or writes."""
 
 Where = tuple[int, Table]
@@ -97,7 +98,10 @@ class _Place:
                 mask = 1 << (self.address.bit or 0)
                 entries[at] = entries[at] & ~mask | (mask if one else 0)
             else:
-                entries[at : at + self.width] = self._packed.unpack(self._words.encode(one))
+                for place, (mask, word) in enumerate(
+                    zip(self._words.masks, self._packed.unpack(self._words.encode(one)), strict=True), at
+                ):
+                    entries[place] = entries[place] & ~mask | word & mask
 
 
 class _TableImage:
@@ -181,6 +185,7 @@ class ModbusEmulator:
 
         """
         self.address = listen
+        self._framing = _framing_of(served)
         self._code, self._program_name = code, program_name
         self._words: Words = {}
         self._lock = threading.Lock()
@@ -211,6 +216,8 @@ class ModbusEmulator:
 
     def change(self, served: Sequence[Served]) -> None:
         """Serve other tables from now on. Entries that are served before and after keep their values."""
+        if _framing_of(served) != self._framing:
+            raise ConfigError("framing: restart the instance to change the framing of an emulated device")
         with self._lock:
             self._serve_tables(served, {place.key for image in self._images for place in image.places})
 
@@ -258,12 +265,14 @@ class ModbusEmulator:
         return restore
 
     async def _serve(self) -> None:
-        from pymodbus.server import ModbusTcpServer  # noqa: PLC0415  it needs the extra
+        from pymodbus import FramerType  # noqa: PLC0415  it needs the extra
+        from pymodbus.server import ModbusTcpServer  # noqa: PLC0415
         from pymodbus.simulator import DataType, SimData, SimDevice  # noqa: PLC0415
 
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # the library logs errors of clients
         nothing = SimDevice(0, simdata=[SimData(0, datatype=DataType.REGISTERS)])
-        server: Any = ModbusTcpServer(nothing, address=(self.address.host, self.address.port))
+        framer = FramerType.RTU if self._framing == "rtu" else FramerType.SOCKET
+        server: Any = ModbusTcpServer(nothing, framer=framer, address=(self.address.host, self.address.port))
         server.context = self._store
         connected = server.callback_new_connection
 
@@ -291,6 +300,14 @@ class ModbusEmulator:
             image.store(before, self._frame, self._words)
 
 
+def _framing_of(served: Sequence[Served]) -> str:
+    """Return the framing of the sources that read a device. Raise ConfigError if they differ."""
+    found = {str(one.options.get("framing", "tcp")) for one in served}
+    if len(found) > 1:
+        raise ConfigError("framing: the sources of one device must have the same framing; give each its own emulator")
+    return found.pop()
+
+
 class _Store:
     """The device's tables, with the methods that pymodbus's server calls. The first entry is number 0."""
 
@@ -299,6 +316,7 @@ class _Store:
         self.written = True
         """True if the tables may differ from the program's image: at first, and after a client has written."""
         self._units = {unit for unit, _ in words}
+        self._masked = 0  # the word that pymodbus changes next, for function 22
 
     def replace(self, words: Words) -> None:
         """Serve these tables from now on."""
@@ -320,6 +338,8 @@ class _Store:
             return entries
         with self._lock:
             found = entries[address : address + count]
+        if function == MASK_WORD:
+            self._masked = found[0]
         return [bool(one) for one in found] if _TABLES[function].of_bits else found
 
     async def async_setValues(self, unit: int, function: int, address: int, values: Sequence[int]) -> Any:  # noqa: N802
@@ -328,6 +348,9 @@ class _Store:
         if not isinstance(entries, list):
             return entries
         with self._lock:
+            if function == MASK_WORD:  # the program may have changed other bits since pymodbus read the word
+                changed = self._masked ^ values[0]
+                values = [entries[address] & ~changed | values[0] & changed]
             entries[address : address + len(values)] = [int(one) for one in values]
             self.written = True
         return None

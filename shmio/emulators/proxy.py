@@ -29,6 +29,8 @@ from shmio.wording import cannot_listen
 Edit = Callable[[bytes], bytes | None]
 Framing = Callable[[bytes | bytearray], int]
 
+_REST_S = 0.1
+"""Time in s for which no connection is accepted after one could not be accepted."""
 _CHUNK = 1 << 16
 _MAX_CLIENTS = 256  # connections at a time: select() takes no descriptors above 1023
 _TIMEOUT_S = 10
@@ -246,6 +248,7 @@ class FaultProxy:
             self._cleanup.close()
             raise EndpointError(cannot_listen(listen, error)) from None
         self._running = True
+        self._rests_until_s = 0.0
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake_out, self._wake_in = socket.socketpair()
         self._thread = threading.Thread(target=self._run, name="fault-proxy", daemon=True)
@@ -425,9 +428,12 @@ class FaultProxy:
         pipes = [] if self._frozen else [pipe for link in self._links for pipe in link.pipes]
         readers = {pipe.source: pipe for pipe in pipes if pipe.hungry}
         writers = {pipe.sink: pipe for pipe in pipes if pipe.due}
-        always = [self._wake_out] if self._listener is None else [self._wake_out, self._listener]
-        next_s = min((pipe.next_s for pipe in pipes), default=None)
-        timeout_s = None if next_s is None or next_s == float("inf") else max(0.0, next_s - time.monotonic())
+        accepts = self._listener is not None and time.monotonic() >= self._rests_until_s
+        always = [self._wake_out, self._listener] if accepts and self._listener else [self._wake_out]
+        rests_s = float("inf") if accepts or self._listener is None else self._rests_until_s
+        next_s = min((pipe.next_s for pipe in pipes), default=float("inf"))
+        next_s = min(next_s, rests_s)
+        timeout_s = None if next_s == float("inf") else max(0.0, next_s - time.monotonic())
         readable, writable, _ = select.select([*always, *readers], list(writers), [], timeout_s)
         for ready in readable:
             if ready is self._wake_out:
@@ -446,7 +452,11 @@ class FaultProxy:
                 self._todo.get_nowait()()
 
     def _accept(self, listener: socket.socket) -> None:
-        client, _ = listener.accept()
+        try:
+            client, _ = listener.accept()
+        except OSError:  # the client has left, or no descriptor is free
+            self._rests_until_s = time.monotonic() + _REST_S
+            return
         if len(self._links) + len(self._waiting) >= _MAX_CLIENTS:
             client.close()
             return

@@ -1,8 +1,8 @@
 """Read tag tables from CSV files and spreadsheets: a header row, then a row for each register.
 
 The columns are ``path`` and ``type``, and any of ``address``, ``unit``, ``comment``, ``scale``,
-``initial``, ``deadband`` and ``writable``, in any order. A comma, semicolon or tab separates the
-cells of a CSV file; with semicolons, numbers have a decimal comma.
+``initial``, ``deadband``, ``writable``, ``word_order`` and ``byte_order``, in any order. A comma,
+semicolon or tab separates the cells of a CSV file; with semicolons, numbers have a decimal comma.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from shmio.layout.workbook import WorkbookError, read_rows
 from shmio.wording import printable, unknown
 
 SUFFIXES: Final = (".csv", ".xlsx")
-COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")
+_TEXTS: Final = ("type", "address", "unit", "comment", "word_order", "byte_order")
+COLUMNS: Final = ("path", *_TEXTS[:4], "scale", "initial", "deadband", "writable", *_TEXTS[4:])
 _BOOLS: Final = {"true": True, "yes": True, "1": True, "x": True, "false": False, "no": False, "0": False}
 _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 
@@ -131,7 +132,7 @@ def _columns(header: Sequence[str], needed: Sequence[str]) -> list[str]:
 
 def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object]:
     """Return a row's cells as an entry like those of a TOML table; raise ValueError if a cell is wrong."""
-    entry: dict[str, object] = {name: cells[name] for name in COLUMNS[1:5] if name in cells}
+    entry: dict[str, object] = {name: cells[name] for name in _TEXTS if name in cells}
     if "initial" in cells:
         real = cells.get("type", "").upper() in ("REAL", "LREAL")
         entry["initial"] = _with_point(cells["initial"], decimal_comma) if real else cells["initial"]

@@ -20,7 +20,8 @@ its elements.
 With ``scale = factor`` or ``scale = [factor, offset]``, the connector computes the value from the
 device's number: number * factor + offset. ``deadband`` is the largest change of the value that the
 connector may ignore. ``writable = true`` has the same effect as naming the register in the
-source's ``writable``.
+source's ``writable``. ``word_order`` and ``byte_order`` of a register override those of a Modbus
+source. They become a part of the address, so that layouts need no keys for one protocol.
 """
 
 from __future__ import annotations
@@ -88,6 +89,8 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     scale: float | tuple[float, float] | None = None
     deadband: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     writable: bool = False
+    word_order: ByteOrder | None = None
+    byte_order: ByteOrder | None = None
 
 
 class _Table(msgspec.Struct, forbid_unknown_fields=True):
@@ -318,7 +321,7 @@ class _Placer:
         initial = None if tag.initial is None else _literal(tag.initial, element)
         register = Register(
             path, element.name, dims, offset, bit, size, math.prod(shape), tag.comment, initial,
-            unit=tag.unit, address=tag.address, scale=_scale(tag, element), deadband=_deadband(tag, element),
+            unit=tag.unit, address=_address(tag), scale=_scale(tag, element), deadband=_deadband(tag, element),
             writable=tag.writable,
         )  # fmt: skip
         if initial is not None:
@@ -328,6 +331,18 @@ class _Placer:
         self._keys[path] = key
         self._end = offset + size
         self._elements += register.count
+
+
+def _address(tag: _Tag) -> str:
+    """Return the address with the orders of words and bytes; raise ValueError if there is no address to have them."""
+    orders = [
+        f" {key}={order}" for key, order in (("word_order", tag.word_order), ("byte_order", tag.byte_order)) if order
+    ]
+    if orders and not tag.address:
+        raise ValueError(
+            f"{orders[0].split('=')[0].strip()}: only a Modbus address has an order; add the key `address`"
+        )
+    return tag.address + "".join(orders)
 
 
 def _scale(tag: _Tag, element: ElementType) -> tuple[float, float] | None:

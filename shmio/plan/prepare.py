@@ -39,7 +39,7 @@ from shmio.plan.scene import check_scene
 from shmio.plan.sources import check_sources, describe, note_options
 from shmio.wording import did_you_mean, unknown
 
-DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order")
+DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order", "framing")
 """Keys of a source that say how its device names or stores values."""
 NONFINITE = ("REAL", "LREAL")
 """Types whose values can be NaN or infinite."""

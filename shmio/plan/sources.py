@@ -289,13 +289,15 @@ def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tupl
 
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
-    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
+    found, inputs, notices = describe(key, msgspec.convert(source.options, Simulation.Options), layout)
+    files.odd += [f"{key}.model: {notice}" for notice in notices]
+    return found, inputs
 
 
 def describe(
     key: str, options: Simulation.Options, layout: Layout | None, name: str = "model"
-) -> tuple[Layout, tuple[str, ...]]:
-    """Return the layout of a model's block, and the paths of its inputs.
+) -> tuple[Layout, tuple[str, ...], tuple[str, ...]]:
+    """Return the layout of a model's block, the paths of its inputs, and what the user should know.
 
     A separate process imports the model.
 
@@ -329,7 +331,7 @@ def describe(
     if answer.error:
         text = f"{name}: {answer.error[7:]}" if answer.error.startswith("model: ") else answer.error
         raise ConfigError(f"{key}.{text}")
-    return load_layout(answer.layout.encode()), answer.inputs
+    return load_layout(answer.layout.encode()), answer.inputs, answer.notices
 
 
 def _check_connections(

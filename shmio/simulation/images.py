@@ -24,6 +24,7 @@ _NUMPY: Final = (np.ndarray, np.generic)
 _BYTES: Final = (bytes, bytearray)
 _ALL: Final = 0xFF
 _MANY_PIECES: Final = 24
+_MAX_SHOWN: Final = 20
 
 
 class Images:
@@ -184,8 +185,8 @@ class Port(Protocol):
         """
 
 
-Limits = tuple[float, float]
-"""The lowest and the highest value that may be given to a model."""
+Limits = tuple[float, float] | Mapping[int, str]
+"""The lowest and the highest value that may be given to a model, or all allowed values with their names."""
 
 
 def port_of(
@@ -202,7 +203,7 @@ def port_of(
         registers: The members of a structure by path, or a single register under ``""``.
         byte_order: The byte order of the values.
         image: The image in which the port reads and writes.
-        limits: The lowest and the highest value that may be written; None: no limits.
+        limits: The values that may be written; None: all.
 
     """
     ports = {member: RegisterPort(register, byte_order, image, limits) for member, register in registers.items()}
@@ -243,7 +244,9 @@ class RegisterPort:
 
         """
         limits = self._limits
-        within = limits is None or (type(value) is float and limits[0] <= value <= limits[1])
+        within = limits is None or (
+            type(value) is float and isinstance(limits, tuple) and limits[0] <= value <= limits[1]
+        )
         if not within and (fault := self.fault(value)):
             raise ValueRangeError(f"{self._path}: {fault}")
         if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
@@ -262,6 +265,12 @@ class RegisterPort:
     def fault(self, value: object) -> str:
         """Return a message if a number in ``value`` is outside the limits; else ""."""
         if self._limits is None:
+            return ""
+        if isinstance(self._limits, Mapping):
+            for one in _flat(value):
+                if one not in self._limits:
+                    items = ", ".join(f"{number} ({name})" for number, name in [*self._limits.items()][:_MAX_SHOWN])
+                    return f"{one} is not an item of the enumeration; expected one of {items}"
             return ""
         low, high = self._limits
         for one in _flat(value):

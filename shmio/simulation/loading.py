@@ -19,7 +19,7 @@ _OWN: Final = "_beside_configuration"
 """Suffix of the names of modules in the folder that have the names of installed ones."""
 
 
-def load(text: str, folder: str | Path | None = None) -> type[Model]:
+def load(text: str, folder: str | Path | None = None, *, strict: bool = False) -> type[Model]:
     """Import a model's class, or make one of an FMU.
 
     Args:
@@ -27,6 +27,7 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
         folder: A folder to search for FMUs and modules first, such as the configuration's folder;
             None: no folder. A file in it precedes an installed module of the same name, also one of
             Python itself, but not shmio.
+        strict: True to refuse an FMU with any formal defect.
 
     Raises:
         ConfigError: The text is malformed, the module or class does not exist, its import fails, or
@@ -35,7 +36,9 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
 
     """
     if fmu.is_fmu(text):
-        return fmu.load_fmu(Path(folder or ".") / text)
+        return fmu.load_fmu(Path(folder or ".") / text, strict=strict)
+    if strict:
+        raise ConfigError("strict = true is only for FMUs; leave it out")
     name, colon, attribute = text.partition(":")
     if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in name.split("."))):
         raise ConfigError(f"expected package.module:Class or the file of an FMU (.fmu), found {text!r}")

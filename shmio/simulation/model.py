@@ -18,7 +18,7 @@ from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.simlog_structures import members
 from shmio.layout.tags import parse_type, place_tags
 from shmio.layout.topic import canonical_path, shorten
-from shmio.simulation.images import Ends, Port
+from shmio.simulation.images import Ends, Limits, Port
 from shmio.wording import printable
 
 _OWN: Final = frozenset({"declarations", "random", "restore_state", "save_state", "start", "step"})
@@ -57,7 +57,7 @@ class Declaration:
         path: str = "",
         unit: str = "",
         comment: str = "",
-        limits: tuple[float, float] | None = None,
+        limits: Limits | None = None,
     ) -> None:
         """Declare a value.
 
@@ -72,7 +72,8 @@ class Declaration:
             unit: The unit in the layout.
             comment: The comment in the layout.
             limits: The lowest and the highest value that may be given to the model: written by a
-                client, by a connection, or as a parameter. Not for outputs.
+                client, by a connection, or as a parameter. Or a dict with all allowed whole numbers
+                and their names. Not for outputs.
 
         """
         self.type = type
@@ -81,6 +82,8 @@ class Declaration:
         self.unit = unit
         self.comment = comment
         self.limits = limits
+        self.any_text = False
+        """True if the register of a text may have any length in a layout, and be a STRING or a WSTRING."""
         self.name = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -132,13 +135,13 @@ class Declaration:
         initial = list(initial) if isinstance(initial, tuple) else initial
         return {"type": kind, "initial": initial, "comment": comment, "unit": self.unit}
 
-    def _check_limits(self, limits: tuple[float, float]) -> None:
+    def _check_limits(self, limits: Limits) -> None:
         if isinstance(self, Output):
             raise ModelError("limits: an output has no limits, because the model computes it")
         with suppress(ValueError):  # an invalid type is reported when it is placed
             if self.members is not None or parse_type(str(self.type))[0].base not in NUMBERS:
                 raise ModelError("limits: only a number or an array of numbers can have limits")
-        if not limits[0] <= limits[1]:
+        if isinstance(limits, tuple) and not limits[0] <= limits[1]:
             raise ModelError(f"limits: expected the lowest and the highest value, found {limits!r}")
 
 
@@ -163,7 +166,7 @@ class Parameter(Declaration):
         *,
         unit: str = "",
         comment: str = "",
-        limits: tuple[float, float] | None = None,
+        limits: Limits | None = None,
     ) -> None:
         super().__init__(type, initial, unit=unit, comment=comment, limits=limits)
 
@@ -241,6 +244,9 @@ class Model(ABC):
     The modules of the model's class and its base classes are always allowed.
     """
 
+    notices: ClassVar[tuple[str, ...]] = ()
+    """What the user should know about the model, for ``shmio-supervisor check``."""
+
     random: np.random.Generator
     """The model's only source of randomness, seeded with the ``seed`` of its source."""
 
@@ -284,6 +290,14 @@ class Model(ABC):
             declaration.__set_name__(made, name)
         _check(made)
         return made
+
+    @classmethod
+    def with_parameters(cls, parameters: Mapping[str, object]) -> tuple[type[Self], Mapping[str, object]]:
+        """Return the class for the parameters of a configuration, and the parameters as it declares them.
+
+        A class may declare other registers for other parameters. An unknown or wrong value is kept.
+        """
+        return cls, parameters
 
     @final
     def __init__(self, ports: Mapping[str, Port], ends: Mapping[str, Ends], seed: int) -> None:

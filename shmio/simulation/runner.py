@@ -35,6 +35,7 @@ from shmio.simulation.model import (
 from shmio.simulation.state import decode_state, encode_state
 from shmio.wording import unknown
 
+_TEXTS: Final = frozenset({"STRING", "WSTRING"})
 NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 
 
@@ -68,7 +69,10 @@ class ModelRunner:
                 fit. The message begins with the key.
 
         """
+        model, parameters = model.with_parameters(parameters)
         self.name = model.reference
+        self.notices = model.notices
+        """What the user should know about the model."""
         self._version = _version(model)  # now, because the files may change
         self.layout = layout_of(model) if layout is None else layout
         found = {declaration: self._find(model, declaration) for declaration in declared(model, Input, Output, InOut)}
@@ -94,6 +98,9 @@ class ModelRunner:
             self._inputs |= own
             if declaration.limits is not None:
                 limited += own.values()
+            for path, port in own.items() if isinstance(declaration.limits, Mapping) else ():
+                if fault := port.fault(port.read()):
+                    raise ConfigError(f"layout: {path}: {fault}; give the register an initial value")
             if isinstance(declaration, InOut):
                 ends[declaration.name] = Ends(commanded, shown)
             else:
@@ -270,7 +277,8 @@ class ModelRunner:
                 register = found[member] = find(self.layout, path)
             except PathError as error:
                 raise ConfigError(f"layout: model {self.name} needs a register {path}, {_kind(own)}: {error}") from None
-            if (register.type, register.dims) != (own.type, own.dims):
+            both_text = declaration.any_text and _TEXTS.issuperset((register.element.base, own.element.base))
+            if register.dims != own.dims or (register.type != own.type and not both_text):
                 raise ConfigError(
                     f"layout: model {self.name} needs {path} as {_kind(own)}; in {self.layout.name} it is "
                     f"{_kind(register)}"

@@ -121,6 +121,8 @@ class ModbusTable:
 
 
 class TestModbus(TableConformance, WriteConformance):
+    repeats_reads = True
+
     @pytest.fixture
     def table(self) -> Iterator[ModbusTable]:
         with Device() as device:

@@ -42,6 +42,15 @@ def build(name: str, folder: Path, change: Callable[[str], str] = str) -> Path:
     return file
 
 
+def edited(fmu: Path, file: Path, edit: Callable[[str], str]) -> Path:
+    """Write an FMU with an edited description and all else of another one, and return its file."""
+    with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(file, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            new.writestr(name, edit(data.decode()) if name == "modelDescription.xml" else data)
+    return file
+
+
 def build_oven(folder: Path) -> Path:
     """Build an FMU of ``oven.py`` by pythonfmu3, and return its file."""
     command = [sys.executable, "-m", "pythonfmu3", "build", "-f", HERE / "oven.py", "-d", folder]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import selectors
 import socket
 import stat
@@ -240,6 +241,26 @@ def test_a_client_that_leaves_before_its_answer_does_no_harm(served: Served) -> 
     client = served.client(b'{"do": "stop"}\n')
     client.close()
     served.requests[1][1].ok()
+
+
+def test_server_rests_while_no_descriptor_is_free(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with ExitStack() as stack:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (300, hard))
+        try:
+            client = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            with suppress(OSError):
+                while True:
+                    stack.enter_context(Path(os.devnull).open())
+            client.connect(served.path)
+            client.sendall(b'{"do": "where"}\n')
+            served.turn()  # ends: the waiting client causes no endless work
+            assert caplog.messages == ["the control socket accepts nobody now: Too many open files"]
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        served.server.expire()
+        served.turn()
+        assert [request for request, _ in served.requests] == [Where()]
 
 
 def test_other_users_are_refused(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:

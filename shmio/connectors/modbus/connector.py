@@ -14,7 +14,14 @@ import numpy as np
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.modbus import client
-from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
+from shmio.connectors.modbus.client import (
+    MAX_WRITE_BITS,
+    MAX_WRITE_WORDS,
+    Framing,
+    ModbusClient,
+    RefusedError,
+    SilentError,
+)
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
 from shmio.connectors.register_image import Copy, RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, Requests
@@ -61,6 +68,18 @@ _TABLE_NAMES: Final = {
     Table.DISCRETE: "discrete input",
 }  # fmt: skip
 NOTE: Final = "addresses that the device refuses take more requests"
+_WORD: Final = 0xFFFF
+_INSTEAD: Final = {
+    client.WRITE_COIL: (client.WRITE_COILS, "shmio writes single coils by function 15"),
+    client.WRITE_COILS: (client.WRITE_COIL, "shmio writes coils one after the other, by function 5"),
+    client.WRITE_WORD: (client.WRITE_WORDS, "shmio writes single words by function 16"),
+    client.WRITE_WORDS: (
+        client.WRITE_WORD,
+        "shmio writes words one after the other, by function 6, so the device may see the half of a number",
+    ),
+    client.MASK_WORD: (client.WRITE_WORD, "to write a part of a word, shmio reads the word and writes it back"),
+}
+"""For each function, the one to use if a device does not know it, and the effect, for the log."""
 
 log = logging.getLogger("shmio.source")
 
@@ -74,10 +93,12 @@ class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_
     """Time-out in ms for connecting, for reading all registers, and for the writes of a cycle."""
     unit: Annotated[int, msgspec.Meta(ge=0, le=255)] = 1
     """Unit id for addresses that name no unit."""
+    framing: Framing = "tcp"
+    """Frames of the device: those of Modbus TCP, or those of a serial line (RTU), sent over TCP."""
     word_order: Order = "big"
-    """Order of the words within a number. With ``big``, the highest word comes first."""
+    """Order of the words within a number. With ``big``, the highest word comes first. A tag may have its own."""
     byte_order: Order = "big"
-    """Order of the bytes within a word. The protocol specifies ``big``."""
+    """Order of the bytes within a word. The protocol specifies ``big``. A tag may have its own."""
     max_registers: Annotated[int, msgspec.Meta(ge=1, le=125)] = 125
     """Maximum number of words in a request."""
     max_bits: Annotated[int, msgspec.Meta(ge=1, le=2000)] = 2000
@@ -155,7 +176,7 @@ class ModbusConnector(Connector):
 
     def __init__(self, options: ModbusOptions, layout: Layout) -> None:
         self._options, self._layout = options, layout
-        self._client = ModbusClient(options.host, options.port, options.timeout)
+        self._client = ModbusClient(options.host, options.port, options.timeout, options.framing)
         self._registers: list[_Register] = []
         for index, register in enumerate(layout.registers):
             try:
@@ -180,7 +201,7 @@ class ModbusConnector(Connector):
         self._units = sorted({one.unit for one in self._registers})
         self._silent: dict[int, _Silence] = {}
         self._probes = 0  # number of probes that this cycle may still send
-        self._no_masks: set[int] = set()  # units that do not know function 22
+        self._unknown: dict[int, set[int]] = {}  # by unit: the write functions that it does not know
 
     @property
     def timeout_s(self) -> float:
@@ -205,7 +226,7 @@ class ModbusConnector(Connector):
         """Connect to the device. Raise ConnectorError if it cannot be reached."""
         self._client.connect()
         self._silent.clear()
-        self._no_masks.clear()
+        self._unknown.clear()
 
     def take_over(self, other: ModbusConnector) -> bool:
         """Take over the connection of another connector, and its knowledge about the units."""
@@ -213,7 +234,7 @@ class ModbusConnector(Connector):
             return False
         self._client, other._client = other._client, self._client
         self._silent = {unit: silence for unit, silence in other._silent.items() if unit in self._units}
-        self._no_masks = other._no_masks
+        self._unknown = other._unknown
         return True
 
     def close(self) -> None:
@@ -403,8 +424,8 @@ class ModbusConnector(Connector):
             try:
                 reason: str | Lost = ""
                 for step in self._steps([writes[place] for place in places]):
-                    self._exchange(*step)
-                    done = True
+                    for _ in self._exchange(*step):
+                        done = True
             except (RefusedError, ValueError) as error:
                 reason = f"only a part was written, and then: {error}" if done else str(error)
             except ConnectorError as error:
@@ -440,28 +461,56 @@ class ModbusConnector(Connector):
             found.setdefault(last, []).append(place)
         return [found[last] for last in sorted(found)]
 
-    def _exchange(self, unit: int, function: int, data: bytes) -> None:
-        """Send one request of a write.
+    def _exchange(self, unit: int, function: int, data: bytes) -> Iterator[None]:
+        """Send the request of a write, and yield after each part that the device has confirmed.
 
-        If the device does not know function 22, read the word, change the bit and write the word: a
-        change that the device makes in between is lost.
+        If the device does not know the function, use another one instead, and remember that.
         """
-        if function != client.MASK_WORD or unit not in self._no_masks:
+        unknown = self._unknown.setdefault(unit, set())
+        if function not in unknown:
             try:
                 self._client.write(unit, function, data)
             except RefusedError as error:
-                if function != client.MASK_WORD or error.code != client.ILLEGAL_FUNCTION:
+                if error.code != client.ILLEGAL_FUNCTION:
                     raise
-                self._no_masks.add(unit)
-                log.warning(
-                    "unit %d cannot write single bits (function 22): shmio reads the word and writes it back instead",
-                    unit,
-                )
             else:
+                yield
                 return
-        start, keep, put = (int.from_bytes(data[at : at + 2], "big") for at in (0, 2, 4))
-        word = int.from_bytes(self._client.read(unit, Table.HOLDING, start, 1), "big")
-        self._client.write(unit, client.WRITE_WORD, data[:2] + (word & keep | put).to_bytes(2, "big"))
+        instead, effect = _INSTEAD[function]
+        try:
+            for request in self._other_requests(unit, function, data):
+                if function == client.MASK_WORD:
+                    yield from self._exchange(unit, instead, request)
+                else:
+                    self._client.write(unit, instead, request)
+                    yield
+        except RefusedError as error:
+            if error.code != client.ILLEGAL_FUNCTION:
+                raise
+            unknown.discard(function)  # the cause may be the address; some devices mix up the exceptions
+            raise RefusedError(error.code, function, *error.functions) from None
+        if function not in unknown:
+            unknown.add(function)
+            log.warning("unit %d does not know function %d: %s", unit, function, effect)
+
+    def _other_requests(self, unit: int, function: int, data: bytes) -> Iterator[bytes]:
+        """Yield the data of the requests that together have the effect of another function."""
+        start, value = int.from_bytes(data[:2], "big"), data[2:4]
+        if function == client.MASK_WORD:
+            keep, put = int.from_bytes(value, "big"), int.from_bytes(data[4:6], "big")
+            word = int.from_bytes(self._client.read(unit, Table.HOLDING, start, 1), "big")
+            yield data[:2] + (word & keep | put).to_bytes(2, "big")
+        elif function == client.WRITE_WORD:
+            yield data[:2] + b"\0\1\2" + value
+        elif function == client.WRITE_COIL:
+            yield data[:2] + b"\0\1\1" + (b"\1" if value[0] else b"\0")
+        else:
+            for place in range(int.from_bytes(value, "big")):
+                if function == client.WRITE_WORDS:
+                    one = data[5 + 2 * place : 7 + 2 * place]
+                else:
+                    one = b"\xff\0" if data[5 + place // 8] >> place % 8 & 1 else b"\0\0"
+                yield (start + place).to_bytes(2, "big") + one
 
     def _steps(self, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
         """Yield the requests (unit, function, data) of joined writes.
@@ -496,9 +545,9 @@ class ModbusConnector(Connector):
         element, byte = divmod(write.offset - register.offset, register.element.stride)
         byte = byte if self._layout.byte_order == "little" else size - 1 - byte  # 0: the lowest
         word, high = divmod(byte, 2)
-        if options.byte_order == "little":
+        if (address.byte_order or options.byte_order) == "little":
             high = 1 - high if size > 1 else 1
-        word = word if options.word_order == "little" else address.width - 1 - word
+        word = word if (address.word_order or options.word_order) == "little" else address.width - 1 - word
         bit = write.mask << 8 * high
         keep, put = 0xFFFF ^ bit, bit if write.data[0] & write.mask else 0
         start = address.number + element * address.width + word
@@ -529,9 +578,8 @@ class ModbusConnector(Connector):
 
     def _most(self, one: _Register) -> int:
         """Return the maximum number of elements that one request may write."""
-        kind = one.address.kind
-        if one.address.bit is not None or (kind.size == 1 and kind.base not in ("STRING", "BOOL")):
-            return 1  # the rest of each word may belong to other registers
+        if one.address.bit is not None or (one.codec is not None and one.codec.masks[-1] != _WORD):
+            return 1  # the rest of a word may belong to other registers
         return MAX_WRITE_BITS if one.address.table.of_bits else max(1, MAX_WRITE_WORDS // one.address.width)
 
     def _requests_of(self, one: _Register, number: int, values: list[Any]) -> Iterator[tuple[int, int, bytes]]:
@@ -550,23 +598,24 @@ class ModbusConnector(Connector):
             )
             yield one.unit, client.WRITE_COILS, start + len(values).to_bytes(2, "big") + bytes((len(packed),)) + packed
             return
-        if address.bit is not None:
-            bit = 1 << address.bit
-            masks = (0xFFFF ^ bit).to_bytes(2, "big") + (bit if values[0] else 0).to_bytes(2, "big")
+        if one.codec is None:
+            bit = 1 << (address.bit or 0)
+            masks = (_WORD ^ bit).to_bytes(2, "big") + (bit if values[0] else 0).to_bytes(2, "big")
             yield one.unit, client.MASK_WORD, start + masks
             return
-        words = b"".join(map(one.codec.encode, values)) if one.codec else b""
-        for at in range(0, len(words), 2 * MAX_WRITE_WORDS):
-            part = words[at : at + 2 * MAX_WRITE_WORDS]
+        words, last = b"".join(map(one.codec.encode, values)), one.codec.masks[-1]
+        whole = words if last == _WORD else words[:-2]
+        for at in range(0, len(whole), 2 * MAX_WRITE_WORDS):
+            part = whole[at : at + 2 * MAX_WRITE_WORDS]
             start = (number + at // 2).to_bytes(2, "big")
-            if address.kind.size == 1 and address.kind.base != "STRING" and len(words) == 2:
-                keep = b"\xff\0" if self._options.byte_order == "big" else b"\0\xff"  # the other byte of the word
-                yield one.unit, client.MASK_WORD, start + keep + part
-            elif len(words) == 2:
+            if len(part) == 2:
                 yield one.unit, client.WRITE_WORD, start + part
             else:
                 count = (len(part) // 2).to_bytes(2, "big") + bytes((len(part),))
                 yield one.unit, client.WRITE_WORDS, start + count + part
+        if len(whole) < len(words):  # the rest of the last word may belong to another register
+            start = (number + len(whole) // 2).to_bytes(2, "big")
+            yield one.unit, client.MASK_WORD, start + (_WORD ^ last).to_bytes(2, "big") + words[-2:]
 
 
 def _places(register: Register) -> Iterator[tuple[int, int, int]]:

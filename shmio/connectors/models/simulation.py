@@ -32,7 +32,7 @@ class Simulation(Computed):
         """Keys of the source.
 
         ``model`` is ``package.module:Class``, or the file of an FMU. Modules that are not installed
-        and FMUs are searched for in ``folder``.
+        and FMUs are searched for in ``folder``. ``strict`` refuses an FMU with any formal defect.
         """
 
         model: str
@@ -40,6 +40,7 @@ class Simulation(Computed):
         seed: Annotated[int, msgspec.Meta(ge=0)] = 0
         connections: dict[str, str] = {}
         folder: str = "."
+        strict: bool = False
 
     def __init__(self, options: Options, layout: Layout) -> None:
         """Create the model.
@@ -108,11 +109,12 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
 
     """
     try:
-        model = load(options.model, options.folder)
+        model = load(options.model, options.folder, strict=options.strict)
+        model, parameters = model.with_parameters(options.parameters)
         own = layout_of(model) if layout is None else layout
     except (ConfigError, ModelError) as error:
         raise ConfigError(f"model: {error}") from None
-    return ModelRunner(model, own, options.parameters, options.seed)
+    return ModelRunner(model, own, parameters, options.seed)
 
 
 # -- as a program ------------------------------------------------------------------------------------------------------
@@ -130,10 +132,11 @@ class Request(msgspec.Struct):
 
 
 class Answer(msgspec.Struct):
-    """The layout of the model's block as JSON and the inputs that can be connected, or an error."""
+    """The layout of the model's block as JSON, the inputs that can be connected and notices; or an error."""
 
     layout: str = ""
     inputs: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
     error: str = ""
 
 
@@ -144,7 +147,7 @@ def main() -> int:
     request = msgspec.json.decode(sys.stdin.buffer.read(), type=Request)
     try:
         runner = make(request.options, None if request.layout is None else load_layout(request.layout.encode()))
-        answer = Answer(runner.layout.to_json().decode(), runner.inputs)
+        answer = Answer(runner.layout.to_json().decode(), runner.inputs, runner.notices)
     except ShmioError as error:
         answer = Answer(error=str(error))
     with os.fdopen(answer_fd, "wb") as stream:

@@ -16,7 +16,7 @@ from shmio.connectors.base import Lost
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_read, explain_write
 from shmio.errors import ConnectorError
-from shmio.layout.values.write import Write
+from shmio.layout.values.write import Write, merge
 
 MAX_ITEMS = 20  # per job; all known controllers accept that many
 JOB_OVERHEAD = 12  # bytes of a request's PDU: header 10, parameters 2
@@ -218,11 +218,15 @@ class BlockWrite:
         self._outcomes[item.write] = self._outcomes[item.write] or reason
 
 
-def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+def waves(
+    db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str], bits: bytes | None = None
+) -> Iterator[BlockWrite]:
     """Divide writes into waves, in order. Each wave must be complete before the next one is sent.
 
     The controller may execute jobs in flight in any order, so writes to the same bits must be in
     different waves. If the controller refuses a write, its wave stores the reason in ``outcomes``.
+    ``bits`` is a mask of the block with the bits that registers have; the others, which are
+    padding, are not written. None: write all bits.
     """
     wave: list[WriteItem] = []
     spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
@@ -232,7 +236,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
             yield BlockWrite(db_number, pdu_size, wave, outcomes)
             wave, spans = [], []
         insort(spans, span)
-        wave += _items(db_number, pdu_size, place, write)
+        wave += _items(db_number, pdu_size, place, write, bits)
     if wave:
         yield BlockWrite(db_number, pdu_size, wave, outcomes)
 
@@ -273,17 +277,23 @@ def touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
     return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
 
 
-def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[WriteItem]:
-    if write.mask:
-        bit = write.mask.bit_length() - 1
-        value = bool(write.data[0] & write.mask)
-        yield WriteItem(place, write.offset, bit_item(db_number, write.offset, bit, value))
-        return
+def _items(db_number: int, pdu_size: int, place: int, write: Write, bits: bytes | None) -> Iterator[WriteItem]:
     most = pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
-    for start in range(0, len(write.data), most):
-        data = write.data[start : start + most]
-        offset = write.offset + start
-        yield WriteItem(place, offset + len(data) - 1, byte_item(db_number, offset, data))
+    for first, mask, data in [write] if write.mask or bits is None else _without_padding(write, bits):
+        if mask:
+            bit = mask.bit_length() - 1
+            yield WriteItem(place, first, bit_item(db_number, first, bit, bool(data[0] & mask)))
+            continue
+        for start in range(0, len(data), most):
+            part = data[start : start + most]
+            yield WriteItem(place, first + start + len(part) - 1, byte_item(db_number, first + start, part))
+
+
+def _without_padding(write: Write, bits: bytes) -> Iterator[Write]:
+    """Yield writes of those bits of a write of bytes that registers have, or that lie outside the layout."""
+    own = bits[write.offset : write.offset + len(write.data)].ljust(len(write.data), b"\xff")
+    for part in merge(write.data, own, [(0, len(own))]):
+        yield part._replace(offset=write.offset + part.offset)
 
 
 def _fill(items: Sequence[WriteItem], pdu_size: int) -> Iterator[list[WriteItem]]:

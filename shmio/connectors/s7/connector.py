@@ -14,7 +14,7 @@ from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Options, S7Session
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
-from shmio.layout.values.write import Write
+from shmio.layout.values.write import Write, covering
 
 __all__ = ["S7Client", "S7Connector", "S7Options"]
 
@@ -36,6 +36,7 @@ class S7Client(S7Session):
         super().__init__(options)
         self.db_number = db_number
         self.size = size
+        self._bits: bytes | None = None  # those that registers have; None: all
 
     def _reads(self) -> list[Read]:
         chunk = self._chunk(self.pdu_size)
@@ -48,7 +49,7 @@ class S7Client(S7Session):
         return min(pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
 
     def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-        return waves(self.db_number, self.pdu_size, writes, outcomes)
+        return waves(self.db_number, self.pdu_size, writes, outcomes, self._bits)
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
         """Return the refusal of a read. If the block is too short, the text gives its real length."""
@@ -104,6 +105,7 @@ class S7Connector(S7Client, Connector):
         if layout.byte_order != "big":
             raise ConfigError(f"layout: {layout.name!r} is little-endian, but a controller's block is big-endian")
         super().__init__(options, number, layout.size)
+        self._bits = covering(layout.own, layout.size, padding=False)
         ends = [(register.offset + register.size, register.path) for register in layout.registers]
         self._described = ExpectedBlock(number, layout.name, layout.size, ends, whole=True)
         self._watch = BlockChangeMonitor([self._described])

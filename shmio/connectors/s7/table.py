@@ -37,7 +37,7 @@ from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Opt
 from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
-from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area, is_of_cpu, parse
 from shmio.layout.topic import shorten
 from shmio.layout.values.write import Write, apply
@@ -503,7 +503,7 @@ class S7TableConnector(S7Session, Connector):
     def _items(self, place: int, tag: Tag, start: int, bit: int | None, data: bytes) -> Iterator[WriteItem]:
         area, db = tag.address.area, tag.address.db
         if bit is not None:
-            yield WriteItem(place, start, bit_item(db, start, bit, bool(data[0]), area))
+            yield WriteItem(place, start, bit_item(db, start, bit, bool(data[0] >> bit & 1), area))
             return
         most = self.pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
         for at in range(0, len(data), most):
@@ -526,18 +526,11 @@ class S7TableConnector(S7Session, Connector):
                 continue
             if register.bit is not None and not register.dims and mask and mask != 1 << register.bit:
                 continue
-            found = True
             if tag.address.area.read_only:
                 raise ValueError(f"{register.path} ({tag.address.text}): {tag.address.area.read_only}")
-            start = tag.address.start
-            if tag.address.bit is not None:
-                value = data[register.offset - offset] >> (register.bit or 0) & 1
-                yield tag, start, tag.address.bit, bytes((value,))
-            elif mask:
-                byte = start + tag.device_bit(offset - register.offset)
-                yield tag, byte, mask.bit_length() - 1, bytes((bool(data[0] & mask),))
-            else:
-                yield from self._elements(tag, write)
+            for start, bits, value in self._device_writes(tag, write):
+                found = True
+                yield tag, tag.address.start + start, bits.bit_length() - 1 if bits else None, value
         if not found:
             if any(
                 one.register.offset < offset + len(data) and offset < one.register.offset + one.register.size
@@ -546,26 +539,17 @@ class S7TableConnector(S7Session, Connector):
                 raise ValueError("values of the CPU can only be read")
             raise ValueError("no register of the tag table covers the written bytes")
 
-    def _elements(self, tag: Tag, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
-        """Yield the changes that a write of bytes makes to one register, as :meth:`_steps` does."""
-        register = tag.register
+    def _device_writes(self, tag: Tag, write: Write) -> Iterator[Write]:
+        """Yield the writes to one register, with offsets from its address in the controller."""
+        register, mask = tag.register, write.mask
+        if mask and register.type != "BOOL":
+            yield Write(tag.device_bit(write.offset - register.offset), mask, write.data)
+            return
         image, covered = bytearray(self._layout.size), bytearray(self._layout.size)
         apply(write, image)
-        apply(Write(write.offset, 0, b"\xff" * len(write.data)), covered)
-        own = bytes(image[register.offset : register.offset + register.size])
-        there = covered[register.offset : register.offset + register.size]
-        start = tag.address.start
-        if register.type == "BOOL":
-            if all(there):
-                yield tag, start, None, own
-                return
-            for byte, bit in bit_positions(register):
-                if there[byte]:
-                    yield tag, start + byte, bit, bytes((own[byte] >> bit & 1,))
-            return
-        for first, count in _covered(register, there):
-            at, data = tag.device_bytes(own, first, count)
-            yield tag, start + at, None, data
+        apply(write._replace(data=b"\xff" * len(write.data)), covered)
+        own = slice(register.offset, register.offset + register.size)
+        yield from tag.device_writes(bytes(image[own]), bytes(covered[own]))
 
 
 def _described(tags: Iterable[Tag]) -> Iterator[ExpectedBlock]:
@@ -604,27 +588,3 @@ def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:
 def _linear(tag: Tag, start: int, bit: int | None) -> int:
     """Return the number of a bit in a sequence of all bits of all areas and blocks."""
     return ((tag.address.area << 16 | tag.address.db) << 24) + 8 * start + (bit or 0)
-
-
-def _covered(register: Register, there: bytes | bytearray) -> Iterator[tuple[int, int]]:
-    """Yield (first, count) for each run of elements that a write sets.
-
-    Raises:
-        ValueError: The write sets only a part of an element.
-
-    """
-    size, stride = register.element.size, register.element.stride
-    first = count = 0
-    for place in range(register.count):
-        part = sum(1 for byte in there[place * stride : place * stride + size] if byte)
-        if part == size:
-            first = first if count else place
-            count += 1
-            continue
-        if part:
-            raise ValueError("a part of a value cannot be written; write the whole value")
-        if count:
-            yield first, count
-            count = 0
-    if count:
-        yield first, count

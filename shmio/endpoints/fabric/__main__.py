@@ -14,7 +14,7 @@ from shmio import worker
 from shmio.endpoints.fabric.server import NatsServer, ServerSettings
 from shmio.endpoints.server_process import serve
 from shmio.fabric.tasks import end
-from shmio.logs import rate_limited
+from shmio.logs import log_loop_errors, rate_limited
 from shmio.worker import BEAT_S, Worker
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ async def _publish(worker: Worker) -> None:
     from shmio.endpoints.fabric.uplink import Uplink, UplinkSettings  # noqa: PLC0415  the server does not need it
 
     loop = asyncio.get_running_loop()
+    log_loop_errors(loop)
     stopping = asyncio.Event()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     uplink = Uplink(worker.segment, worker.slot, msgspec.convert(worker.config, UplinkSettings))

@@ -21,7 +21,7 @@ from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feed import Feeds, VirtualTime
 from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import SegmentError, ShmioError
-from shmio.logs import fields, rate_limited
+from shmio.logs import fields, log_loop_errors, rate_limited
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
@@ -38,6 +38,7 @@ def run(worker: Worker) -> None:
 
 async def _serve(worker: Worker) -> None:
     loop = asyncio.get_running_loop()
+    log_loop_errors(loop)
     stopping = asyncio.Event()
     rereading = asyncio.Lock()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))

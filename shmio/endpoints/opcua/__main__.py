@@ -13,7 +13,7 @@ from shmio import worker
 from shmio.config import OpcUa
 from shmio.config.opcua import EXTRA
 from shmio.errors import ConfigError
-from shmio.logs import rate_limited
+from shmio.logs import log_loop_errors, rate_limited
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.opcua", "asyncua", "asyncio")
@@ -33,6 +33,7 @@ async def _serve(worker: Worker) -> None:
     from shmio.endpoints.opcua.endpoint import Endpoint  # noqa: PLC0415  this import needs the extra
 
     loop = asyncio.get_running_loop()
+    log_loop_errors(loop)
     stopping = asyncio.Event()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     endpoint = Endpoint(worker.segment, worker.slot, msgspec.convert(worker.config, OpcUa))

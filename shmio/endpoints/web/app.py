@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -212,7 +213,7 @@ class PageApp:
             body = await self._uploads.receive(request.stream())
             if body is None:
                 return JSONResponse({"error": f"these files have more than {MAX_BYTES >> 20} MB"}, 413)
-            return Response(await self._uploads.compile(body), media_type="application/json")
+            return Response(await _while_connected(request, self._uploads.compile(body)), media_type="application/json")
         except ClientDisconnect:
             return Response(status_code=400)  # nobody reads it
         except EndpointError as error:
@@ -282,6 +283,24 @@ async def _body(request: Request, most_bytes: int) -> bytes | None:
                 return None
         return bytes(body)
     return None
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, bytes]) -> bytes:
+    """Return the result of work for a request whose body was received. Cancel the work if the client leaves.
+
+    Raises:
+        ClientDisconnect: The client has left.
+    """
+    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(request.receive()))  # next comes only a disconnect
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if not tasks[0].done():
+            raise ClientDisconnect
+        return tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _host(request: HTTPConnection) -> str:

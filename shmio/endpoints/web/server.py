@@ -52,6 +52,8 @@ _HEADERS: Final = (
     (b"cache-control", b"no-store"),
 )
 """The headers of each answer."""
+_TCP_CLOSE: Final = 7  # tcp_states.h of Linux: the client has reset the connection
+_TCP_CLOSE_WAIT: Final = 8  # the client has closed its side
 _log = logging.getLogger("shmio.web")
 
 
@@ -88,7 +90,7 @@ class _Connection(asyncio.Protocol):
     def review(self) -> None:
         """End the connection if its client has not read or closed it for too long. Call this about once a second."""
         now_s = self.loop.time()
-        if self.closing_s is None and self.transport.is_closing():
+        if self.closing_s is None and (self.transport.is_closing() or getattr(self, "close_sent", False)):
             self.closing_s = now_s
         if any(since_s is not None and now_s - since_s >= UNREAD_S for since_s in (self.unread_s, self.closing_s)):
             self.transport.abort()
@@ -115,6 +117,14 @@ class _WebSocket(_Connection, WebSocketsSansIOProtocol):
         super().resume_writing()
         if not self.read_paused:
             self.transport.resume_reading()
+
+    def review(self) -> None:
+        """End the connection also if its client has left. asyncio does not see that while the page reads nothing."""
+        super().review()
+        if self.read_paused:
+            state = self.transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
+            if state in (_TCP_CLOSE, _TCP_CLOSE_WAIT):
+                self.transport.abort()
 
     def send_receive_event_to_app(self) -> None:
         """Hand a message to the page. A text that is not UTF-8 ends the connection (RFC 6455, section 8.1)."""
@@ -389,7 +399,7 @@ class HttpServer:
         Raises:
             EndpointError: The address cannot be used.
         """
-        log_loop_errors()
+        log_loop_errors(asyncio.get_running_loop())
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

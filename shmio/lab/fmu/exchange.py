@@ -91,7 +91,7 @@ def kind_of(register: Register) -> str | None:
         return "Integer"
     if base in _LARGE:
         return "Real"
-    return "Boolean" if base == "BOOL" else "String" if base == "STRING" else None
+    return "Boolean" if base == "BOOL" else "String" if base in ("STRING", "WSTRING") else None
 
 
 def _names(source: str, register: Register) -> Iterator[str]:
@@ -139,10 +139,12 @@ class Values:
             at, texts = self._numbers.size, []
             for _ in range(self.counts["String"]):
                 (size,) = struct.unpack_from("=I", data, at)
-                texts.append(data[at + 4 : at + 4 + size].decode(errors="replace"))
+                texts.append(data[at + 4 : at + 4 + size].decode())
                 at += 4 + size
         except struct.error:
             raise ValueRangeError("the message of the FMU's library is too short") from None
+        except UnicodeDecodeError:
+            raise ValueRangeError("the program that runs the FMU has set a text that is not UTF-8") from None
         reals, integers = self.counts["Real"], self.counts["Integer"]
         return {
             "Real": list(numbers[:reals]),

@@ -1,10 +1,11 @@
 """Addresses of Modbus registers in tag tables, and the words that a value takes there.
 
-An address is ``[unit N] TABLE NUMBER[.BIT] [TYPE]``: ``holding 100``, ``unit 2 input 7``, ``coil 3``,
-``holding 100.3``, ``holding 100 UINT``. Numbers count from 0, as in the protocol. An address may
-also be a number as in manuals, which count from 1 and put the digit of the table first: ``40101``
-and ``400101`` mean ``holding 100``. TYPE is the type in the device; it may be left out if it is
-that of the register.
+An address is ``[unit N] TABLE NUMBER[.BIT] [TYPE] [word_order=ORDER] [byte_order=ORDER]``: ``holding
+100``, ``unit 2 input 7``, ``coil 3``, ``holding 100.3``, ``holding 100 UINT``. Numbers count from 0, as
+in the protocol. An address may also be a number as in manuals, which count from 1 and put the digit of
+the table first: ``40101`` and ``400101`` mean ``holding 100``. TYPE is the type in the device; it may be
+left out if it is that of the register. Tag tables have keys for the orders, which become a part of the
+address.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal
@@ -47,9 +49,11 @@ _OF_DIGIT: Final = {"0": Table.COIL, "1": Table.DISCRETE, "3": Table.INPUT, "4":
 _ADDRESS: Final = re.compile(
     r"(?:unit\s+(?P<unit>[0-9]{1,3})\s+)?"
     r"(?:(?P<table>coil|discrete|input|holding)\s+(?P<number>[0-9]{1,5})|(?P<manual>[0134][0-9]{4,5}))"
-    r"(?:\.(?P<bit>[0-9]{1,2}))?(?:\s+(?P<type>[A-Za-z_]+(?:\[[0-9]+\])?))?",
+    r"(?:\.(?P<bit>[0-9]{1,2}))?(?:\s+(?P<type>[A-Za-z_]+(?:\[[0-9]+\])?))?"
+    r"(?:\s+word_order=(?P<words>big|little))?(?:\s+byte_order=(?P<bytes>big|little))?",
     re.IGNORECASE,
 )
+_ORDERS: Final[Mapping[str, Order]] = {"big": "big", "little": "little"}
 _CODES: Final = {
     "SINT": "b", "USINT": "B", "BYTE": "B", "INT": "h", "UINT": "H", "WORD": "H", "DINT": "i", "UDINT": "I",
     "DWORD": "I", "TIME": "i", "REAL": "f", "LINT": "q", "ULINT": "Q", "LWORD": "Q", "LREAL": "d", "LTIME": "q",
@@ -67,6 +71,9 @@ class Address:
         number: Number in the table, from 0.
         bit: Bit of the word, 0 to 15; None: the whole word.
         kind: Type of the element in the device.
+        word_order: Order of the words within a number; None: the order that the source has by
+            default.
+        byte_order: Order of the bytes within a word; None: as for ``word_order``.
 
     """
 
@@ -75,6 +82,8 @@ class Address:
     number: int
     bit: int | None
     kind: ElementType
+    word_order: Order | None = None
+    byte_order: Order | None = None
 
     @property
     def width(self) -> int:
@@ -110,7 +119,8 @@ def parse(register: Register) -> Address:
     kind = register.element if found["type"] is None else element_type(found["type"])
     if kind is None:
         raise ValueError(f"{text!r}: unknown type {found['type']!r}")
-    address = Address(unit, table, number, None if found["bit"] is None else int(found["bit"]), kind)
+    words, octets = (None if found[key] is None else _ORDERS[found[key].lower()] for key in ("words", "bytes"))
+    address = Address(unit, table, number, None if found["bit"] is None else int(found["bit"]), kind, words, octets)
     _check(address, register, text)
     return address
 
@@ -128,6 +138,8 @@ def _check(address: Address, register: Register, text: str) -> None:
         )
     if is_bit and register.dims and not table.of_bits:
         raise ValueError(f"{text!r}: an array of BOOL needs coils or discrete inputs")
+    if is_bit and (address.word_order or address.byte_order):
+        raise ValueError(f"{text!r}: a BOOL has no order of words or bytes; leave out word_order and byte_order")
     if not is_bit and kind.base != "STRING" and kind.base not in _CODES:
         raise ValueError(f"{text!r}: Modbus has no {kind.name}; it has {', '.join(_CODES)} and STRING[n]")
     if (kind.base == "STRING") != (register.element.base == "STRING"):
@@ -142,15 +154,24 @@ class WordCodec:
     """Converts the elements of one register between the device's words and values."""
 
     def __init__(self, address: Address, register: Register, word_order: Order, byte_order: Order) -> None:
+        """Prepare the conversion. The address may have other orders than those given here."""
         self._text = address.kind.base == "STRING"
         self._bytes, self._length = 2 * address.width, address.kind.length
-        self._swap_bytes, self._swap_words = byte_order == "little", word_order == "little" and not self._text
+        self._swap_bytes = (address.byte_order or byte_order) == "little"
+        self._swap_words = (address.word_order or word_order) == "little" and not self._text
         self._scale = register.scale
         self._whole = register.element.base not in ("REAL", "LREAL")
         self._whole_there = address.kind.base not in ("REAL", "LREAL")
         code = "B" if self._text else _CODES[address.kind.base]
         self._struct = struct.Struct(f">{'x' if address.kind.size == 1 else ''}{code}")
         self._name = address.kind.name
+        own = (
+            b"\xff" * self._length + b"\0" * (self._bytes - self._length)
+            if self._text
+            else (b"\0\xff" if address.kind.size == 1 else b"\xff" * self._bytes)
+        )
+        self.masks: Final = struct.unpack(f">{address.width}H", self.ordered(own))
+        """For each word of an element, the bits that the element takes. The rest belongs to something else."""
 
     def decode(self, data: bytes) -> Scalar:
         """Return an element's value. ``data`` are the element's words as the device sent them."""
@@ -165,8 +186,8 @@ class WordCodec:
         """Return a value as words to send; raise ValueError if the device's type cannot hold it."""
         if self._text:
             data = str(value).encode("latin-1", "replace")
-            if len(data) > self._bytes:
-                raise ValueError(f"the device's {self._name} holds {self._bytes} characters, not {len(data)}")
+            if len(data) > self._length:
+                raise ValueError(f"the device's {self._name} holds {self._length} characters, not {len(data)}")
             return self.ordered(data.ljust(self._bytes, b"\0"))
         if not isinstance(value, int | float):
             raise TypeError(f"{value!r} is not a number")

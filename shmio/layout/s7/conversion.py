@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -11,6 +11,7 @@ from shmio.errors import ValueRangeError
 from shmio.layout.model import ByteOrder, ElementType, Register
 from shmio.layout.s7.address import Address, Area
 from shmio.layout.values.codec import Value, codec, scalar_codec
+from shmio.layout.values.write import Write, element_bits, merge
 
 _LARGEST_COUNT: Final = 999
 _S5_BASES_MS: Final = (10, 100, 1000, 10_000)
@@ -50,6 +51,7 @@ class Conversion:
             size=address.size, partial=False,
         )  # fmt: skip
         self._out = replace(register, offset=0)
+        self._bits = bytes(element_bits(register))
 
     def image_bytes(self, data: bytes) -> bytes | None:
         """Convert the register's bytes from the controller's form to the image's.
@@ -79,6 +81,54 @@ class Conversion:
         factor, offset = self.register.scale or (1, 0)
         value = number * factor + offset if self.register.scale else number
         return value if self.register.type in ("REAL", "LREAL") or isinstance(value, int | str) else round(value)
+
+    def device_writes(self, image: bytes, bits: bytes) -> Iterator[Write]:
+        """Yield the writes that carry some bits of the register to the controller, and change no other bit there.
+
+        Args:
+            image: The register's bytes in the image.
+            bits: The bits to write, as a mask of the register's size. All bits of a number, text or
+                time must be set, or none.
+
+        Yields:
+            Writes whose offsets count from the start of the value in the controller.
+
+        Raises:
+            ValueError: The bytes are not a valid value, the controller cannot hold it, or ``bits``
+                has only a part of a value.
+
+        """
+        if self.address.bit is not None:
+            if bits[0] & self._bits[0]:
+                value = bool(image[0] & self._bits[0])
+                yield Write(0, 1 << self.address.bit, b"\xff" if value else b"\0")
+            return
+        wanted = bytes(one & own for one, own in zip(bits, self._bits, strict=True))
+        if self.register.type == "BOOL":
+            yield from merge(image, wanted, [(0, len(wanted))])
+            return
+        for first, count in self._runs(wanted):
+            at, data = self.device_bytes(image, first, count)
+            yield Write(at, 0, data)
+
+    def _runs(self, bits: bytes) -> Iterator[tuple[int, int]]:
+        """Yield (first, count) of each run of elements to write; the runs have no padding between elements."""
+        size, stride = self.register.element.size, self.register.element.stride
+        dense = size == stride and self.address.kind.size == self.address.kind.stride
+        first = count = 0
+        for place in range(self.register.count):
+            part = bits[place * stride : place * stride + size]
+            if part == b"\xff" * size:
+                first, count = (first, count + 1) if count and dense else (place, 1)
+                if dense:
+                    continue
+            elif any(part):
+                raise ValueError("a part of a value cannot be written; write the whole value")
+            if count:
+                yield first, count
+                count = 0
+        if count:
+            yield first, count
 
     def device_bytes(self, image: bytes, first: int, count: int) -> tuple[int, bytes]:
         """Convert elements of the register to the controller's form.

@@ -15,7 +15,7 @@ import msgspec
 
 from shmio.errors import PathError
 from shmio.layout.glob import Glob
-from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, element_position, index_at
+from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, bit_positions, index_at
 from shmio.layout.topic import find_each, names_part, part_of, slice_of
 from shmio.layout.values.codec import codec
 
@@ -75,11 +75,29 @@ def bits_of(register: Register) -> bytes:
     return bytes([1 << register.bit])
 
 
-def covering(registers: Iterable[Register], size: int) -> bytes:
-    """Return an image of ``size`` bytes in which the bits of these registers are set."""
+def element_bits(register: Register) -> bytes:
+    """Return a mask of ``register.size`` bytes in which only the bits of the register's elements are set.
+
+    Unlike :func:`bits_of`, the mask leaves out the padding of an array: the rest of the last byte
+    of each row of BOOLs, and bytes between elements of an odd size. In a device, these bits may
+    belong to something else.
+    """
+    mask = bytearray(register.size)
+    if register.type == "BOOL":
+        for at, bit in bit_positions(register):
+            mask[at] |= 1 << bit
+        return bytes(mask)
+    size, stride = register.element.size, register.element.stride
+    for place in range(register.count):
+        mask[place * stride : place * stride + size] = b"\xff" * size
+    return bytes(mask)
+
+
+def covering(registers: Iterable[Register], size: int, *, padding: bool = True) -> bytes:
+    """Return an image of ``size`` bytes in which the bits of these registers are set; with or without padding."""
     mask = bytearray(size)
     for register in registers:
-        for at, bits in enumerate(bits_of(register), register.offset):
+        for at, bits in enumerate(bits_of(register) if padding else element_bits(register), register.offset):
             mask[at] |= bits
     return bytes(mask)
 
@@ -171,11 +189,7 @@ def elements(layout: Layout, register: Register) -> Iterator[Register]:
 
 def _fill_rows(mask: bytearray, register: Register) -> None:
     """Set all bits of each byte of a BOOL array in which all bits of the array are set."""
-    own = bytearray(register.size)
-    for flat in range(register.count):
-        byte, bit = element_position(register.element, register.shape, flat)
-        own[byte] |= 1 << (bit or 0)
-    for at, bits in enumerate(own, register.offset):
+    for at, bits in enumerate(element_bits(register), register.offset):
         if mask[at] & bits == bits:
             mask[at] = 0xFF
 

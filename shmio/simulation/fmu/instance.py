@@ -19,6 +19,8 @@ from shmio.wording import printable
 WARNING: Final = 1
 DISCARD: Final = 2
 FATAL: Final = 4
+MAX_UPDATES: Final = 1000
+"""Maximum number of updates of discrete states at one event."""
 STATUSES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 _LAST_SUCCESSFUL_TIME: Final = 2
 _TERMINATED: Final = 3
@@ -68,19 +70,27 @@ class Instance:
         self._error: type[Exception] = FMICallException
         self.version = description.version
         self._start_s = description.start_s
+        self._has_events = False
         self.words = ""
         """The FMU's last message about a problem in the present call."""
         self._status = 0  # the worst status of all calls
-        try:
-            self._fmu: Any = instantiate_fmu(
-                str(folder),
-                description.parsed,
-                "CoSimulation",
-                logger=self._log,
-                early_return_allowed=description.returns_early,
-            )
-        except Exception as error:  # noqa: BLE001  FMPy raises Exception
-            raise FmuError(self._with_words(f"it cannot be loaded: {shorten(printable(str(error)), 300)}")) from None
+        for event_mode in (True, False) if description.has_events else (False,):
+            try:
+                self._fmu: Any = instantiate_fmu(
+                    str(folder),
+                    description.parsed,
+                    "CoSimulation",
+                    logger=self._log,
+                    early_return_allowed=description.returns_early,
+                    event_mode_used=event_mode,
+                )
+                self._has_events = event_mode
+                break
+            except Exception as error:  # noqa: BLE001  FMPy raises Exception
+                reason = shorten(printable(str(error)), 300)
+                if not event_mode:
+                    raise FmuError(self._with_words(f"it cannot be loaded: {reason}")) from None
+                log.warning("the FMU cannot be loaded with the event mode that it states: %s", reason)
         self._component = ctypes.c_void_p(self._fmu.component)
         self._call_do_step: Callable[..., int] = self._fmu.dll[f"fmi{self.version}DoStep"]
         self._true = _BOOLEAN[self.version](1)
@@ -89,19 +99,26 @@ class Instance:
 
     def group(self, variables: Iterable[Variable], ports: Mapping[str, Port]) -> list[Group]:
         """Divide variables into groups. One call to the FMU reads or writes all variables of a group."""
-        by_type: dict[str, list[Variable]] = {}
+        by_type: dict[tuple[str, bool], list[Variable]] = {}
         for variable in variables:
-            by_type.setdefault(variable.fmi_type, []).append(variable)
+            by_type.setdefault((variable.fmi_type, variable.discrete), []).append(variable)
         return [
-            Group(self.version, self._fmu.dll, self._component, type_, alike, ports) for type_, alike in by_type.items()
+            Group(self.version, self._fmu.dll, self._component, type_, alike, ports)
+            for (type_, _), alike in by_type.items()
         ]
 
-    def initialise(self, parameters: list[Group], inputs: list[Group]) -> None:
+    def initialise(self, structure: list[Group], parameters: list[Group], inputs: list[Group]) -> None:
         """Set the parameters and inputs of the FMU, and initialise it.
 
-        A group of parameters is left out if all its values equal the FMU's own.
+        A group of parameters is left out if all its values equal the FMU's own. ``structure`` are the structural
+        parameters, which determine the sizes of arrays.
         """
         with self._calling():
+            if any(group.is_other for group in structure):
+                self._fmu.enterConfigurationMode()
+                for group in structure:
+                    self._check(group.setter, group.set_other())
+                self._fmu.exitConfigurationMode()
             for group in parameters:
                 self._check(group.setter, group.set_other())
             if self.version == 2:
@@ -112,13 +129,48 @@ class Instance:
             for group in inputs:
                 self._check(group.setter, group.set_changed())
             self._fmu.exitInitializationMode()
+            if self._has_events:
+                self._update()
 
     def set(self, groups: list[Group]) -> None:
-        """Give the FMU the values of each group in which a value has changed since the last call."""
+        """Give the FMU the values of each group in which a value has changed since the last call.
+
+        Raises:
+            ModelError: The FMU refuses a value. It can make further steps.
+
+        """
         self.words = ""
-        for group in groups:
-            if (status := group.set_changed()) > WARNING:
-                raise self._failed(group.setter, status)
+        in_event_mode = False
+        try:
+            for group in groups:
+                if self._has_events and group.is_discrete and not in_event_mode and group.is_changed:
+                    with self._calling():
+                        self._fmu.enterEventMode()  # discrete inputs can change only there
+                    in_event_mode = True
+                if (status := group.set_changed()) == DISCARD:
+                    group.forget()
+                    raise ModelError(self._with_words(f"{group.setter}: the FMU refuses a value of {group.names}"))
+                if status > WARNING:
+                    raise self._failed(group.setter, status)
+        except FmuError:
+            in_event_mode = False
+            raise
+        finally:
+            if in_event_mode:
+                self._update()
+
+    def _update(self) -> None:
+        """Let the FMU, which is in its event mode, compute its discrete states, and return to its step mode."""
+        with self._calling():
+            for _ in range(MAX_UPDATES):
+                is_needed, terminates, *_ = self._fmu.updateDiscreteStates()
+                if terminates:
+                    raise FmuError(self._with_words("it has ended its simulation at an event"))
+                if not is_needed:
+                    break
+            else:
+                raise FmuError(self._with_words(f"its discrete states need more than {MAX_UPDATES} updates"))
+            self._fmu.enterStepMode()
 
     def get(self, outputs: Outputs) -> None:
         """Read the values of all outputs from the FMU, and write them to the variables' ports.
@@ -208,6 +260,10 @@ class Instance:
         self._check("fmi3DoStep", status)
         if terminates.value:
             raise FmuError(self._with_words(f"it has ended its simulation at {reached_s.value:g} s"))
+        if self._has_events and event.value:
+            with self._calling():
+                self._fmu.enterEventMode()
+            self._update()
         return reached_s.value if is_early.value else math.inf
 
     def close(self) -> None:
@@ -302,6 +358,7 @@ class Group:
         references = (ctypes.c_uint * len(variables))(*(one.reference for one in variables))
         self._ports = [ports[one.name] for one in variables]
         self._names = [one.name for one in variables]
+        self.is_discrete = any(one.discrete for one in variables)
         self._arrays = any(one.shape for one in variables)
         self._shapes = [one.shape for one in variables]
         self._values = (c_type * sum(one.size for one in variables))()
@@ -346,8 +403,18 @@ class Group:
             for view, one in zip(self._views, data, strict=True):
                 view[:] = one
             return
-        self._show([(text or b"").decode(errors="replace") for text in self._texts])
+        self._show([self._text(text or b"") for text in self._texts])
         self._shown = self._texts, [bytes(view) for view in self._views]
+
+    def _text(self, data: bytes) -> str:
+        """Return a text of the FMU. FMI demands UTF-8."""
+        try:
+            return data.decode()
+        except UnicodeDecodeError:
+            log.warning(
+                "the FMU returned a text that is not UTF-8 for one of %s; � stands for its wrong bytes", self.names
+            )
+            return data.decode(errors="replace")
 
     def _show(self, values: list[Any]) -> None:
         if not self._arrays:
@@ -360,9 +427,24 @@ class Group:
             port.write(_shaped(values[place : place + count], shape))
             place += count
 
+    @property
+    def names(self) -> str:
+        """The names of the variables, for messages."""
+        return shorten(printable(", ".join(self._names)))
+
+    @property
+    def is_changed(self) -> bool:
+        """True if the registers' bytes are others than at the last call of :meth:`set_changed`."""
+        return [bytes(view) for view in self._views] != self._given_bytes
+
+    @property
+    def is_other(self) -> bool:
+        """True if a port has another value than the FMU's own initial one."""
+        return [port.read() for port in self._ports] != self._starts
+
     def set_other(self) -> int:
         """Give the FMU the values of the ports, unless they all equal its own initial values. Return the status."""
-        return 0 if [port.read() for port in self._ports] == self._starts else self.set_changed()
+        return self.set_changed() if self.is_other else 0
 
     def set_changed(self) -> int:
         """Give the FMU the values of all ports if any of them has changed since the last call. Return the status.

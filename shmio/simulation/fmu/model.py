@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Self
 
 import msgspec
 
 from shmio.errors import ModelError, ShmioError, SnapshotError
+from shmio.layout.values.codec import nest
 from shmio.simulation.fmu.archive import Archive, Extracted
-from shmio.simulation.fmu.description import Description, describe
+from shmio.simulation.fmu.description import NO_STRUCTURE, STRUCTURAL, Description, Variable, describe, start_value
 from shmio.simulation.fmu.instance import FmuError, Group, Instance, Outputs
 from shmio.simulation.model import Model
 
@@ -30,8 +33,12 @@ def is_fmu(text: str) -> bool:
     return text.lower().endswith(SUFFIX)
 
 
-def load_fmu(file: Path) -> type[FmuModel]:
+def load_fmu(file: Path, *, strict: bool = False) -> type[FmuModel]:
     """Return a model class for an FMU, without running any of the FMU's code.
+
+    Args:
+        file: The FMU.
+        strict: True to refuse a description with any formal defect.
 
     Raises:
         ModelError: The file is not an FMU that shmio can run on this machine.
@@ -39,10 +46,17 @@ def load_fmu(file: Path) -> type[FmuModel]:
     """
     try:
         archive = Archive(file)
-        description = describe(archive)
+        return _model_of(archive, strict=strict, structure=NO_STRUCTURE)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from None
-    return FmuModel.with_declarations(file.name, description.declarations, archive=archive, description=description)
+
+
+def _model_of(archive: Archive, *, strict: bool, structure: Mapping[str, int]) -> type[FmuModel]:
+    description = describe(archive, strict=strict, structure=structure)
+    return FmuModel.with_declarations(
+        archive.path.name, description.declarations, archive=archive, description=description,
+        notices=description.notices, strict=strict, structure=structure,
+    )  # fmt: skip
 
 
 class _SavedFmu(msgspec.Struct, forbid_unknown_fields=True):
@@ -59,6 +73,9 @@ class FmuModel(Model):
 
     archive: ClassVar[Archive]
     description: ClassVar[Description]
+    strict: ClassVar[bool] = False
+    structure: ClassVar[Mapping[str, int]] = NO_STRUCTURE
+    """The values of structural parameters that the sizes of arrays depend on."""
 
     _instance: Instance | None = None
     _folder: Extracted | None = None
@@ -70,6 +87,25 @@ class FmuModel(Model):
     _fixed_ns = 0  # length of all steps, if the FMU needs that
     _now_s = 0.0  # the FMU's own time
 
+    @classmethod
+    def with_parameters(cls, parameters: Mapping[str, object]) -> tuple[type[Self], Mapping[str, object]]:
+        """Return the class whose arrays have the sizes that structural parameters state, and nested lists for matrices.
+
+        Raises:
+            ModelError: The sizes are not possible.
+
+        """
+        model: type[Any] = cls
+        structure = {
+            one.name: value
+            for one in cls.description.variables
+            if one.causality == STRUCTURAL and type(value := parameters.get(one.name)) is int
+        }
+        if structure != cls.structure:
+            model = _model_of(cls.archive, strict=cls.strict, structure=structure)
+        variables = {one.name: one for one in model.description.variables}
+        return model, {name: _declared(value, variables.get(name)) for name, value in parameters.items()}
+
     def start(self) -> None:
         """Load and initialise the FMU."""
         if self._failure:
@@ -77,13 +113,13 @@ class FmuModel(Model):
         try:
             self._folder = self.archive.extract()
             self._instance = instance = Instance(self.description, self._folder.path)
-            self._inputs, outputs, parameters = (
+            self._inputs, outputs, parameters, structure = (
                 instance.group([one for one in self.description.variables if one.causality == causality], self._ports)
-                for causality in ("input", "output", "parameter")
+                for causality in ("input", "output", "parameter", STRUCTURAL)
             )
             self._outputs = Outputs(outputs)
             self._now_s = self.description.start_s
-            instance.initialise(parameters, self._inputs)
+            instance.initialise(structure, parameters, self._inputs)
             instance.get(self._outputs)
         except ShmioError as error:
             raise self._fail(error) from None
@@ -193,6 +229,18 @@ class FmuModel(Model):
         if self._folder is not None:
             self._folder.remove()
             self._folder = None
+
+
+def _declared(value: object, variable: Variable | None) -> object:
+    """Return a parameter's value as declared: a matrix also from a flat list, or from the text of a start value."""
+    if variable is None or not variable.shape:
+        return value
+    if isinstance(value, str) and variable.fmi_type != "String":
+        with suppress(ValueError):
+            value = start_value(value, variable)
+    if isinstance(value, list) and len(value) == variable.size and not any(isinstance(one, list) for one in value):
+        return nest(value, variable.shape)
+    return value
 
 
 def _point_s(passed_ns: int, dt_ns: int) -> float:

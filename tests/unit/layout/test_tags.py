@@ -111,7 +111,8 @@ WRONG = {
     ":3:1: error: 'b/c': this key is given twice",
     "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: this key is given twice; write a path with a dot in",
     "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: unknown key 'b'; valid: type, "
-    'initial, comment, unit, address, scale, deadband, writable; write a path with a dot in quotes, "a.b"',
+    "initial, comment, unit, address, scale, deadband, writable, word_order, byte_order; write a path with a dot in "
+    'quotes, "a.b"',
     "[registers]\na/b = 'INT'": "write a path in quotes",
     "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: unknown type",
 }

@@ -88,6 +88,7 @@ def test_model_declares_its_registers(folder: Path) -> None:
         "seed": 4,
         "connections": {},
         "folder": str(folder),
+        "strict": False,
     }
 
 

@@ -60,6 +60,15 @@ class Observation(msgspec.Struct, frozen=True, gc=False):
     element: str
     text: str
     native_code: str
+    quality: str = "VALID"
+    """What the agent says about the value: VALID, INVALID or UNVERIFIABLE."""
+
+    @property
+    def doubt(self) -> str:
+        """Why the value is uncertain; "" if it is not."""
+        if self.quality != "VALID":
+            return f"the agent reports the quality {self.quality[:40]}"
+        return "" if self.source_ns else "its timestamp cannot be read"
 
 
 @dataclass
@@ -276,6 +285,7 @@ class StreamsDocument(_Document):
                     _local(name),
                     self._whole_text(),
                     get("nativeCode", ""),
+                    get("quality", "VALID"),
                 )
             )
         elif self._depth < self._values_depth:

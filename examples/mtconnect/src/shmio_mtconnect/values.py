@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Sequence
@@ -18,8 +19,12 @@ from shmio.model.statuses import (
     BAD_NOT_SUPPORTED,
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
+    GOOD,
+    UNCERTAIN,
 )
 from shmio_mtconnect.documents import DataItem, Observation
+
+log = logging.getLogger("shmio.source")
 
 LEVELS: Final = {"Normal": 0, "Warning": 1, "Fault": 2}
 MAX_ACTIVE: Final = 1000
@@ -124,6 +129,7 @@ class Target:
         """True if a finite number is the register's value as it is."""
         self._conditions = Conditions()
         self._last = -1
+        self._doubted = False
 
     def put(self, image: RegisterImage, observation: Observation, *, whole: bool) -> None:
         """Store an observation, unless it is older than the last.
@@ -155,12 +161,16 @@ class Target:
         except OverflowError:
             image.fail(self._index, BAD_OUT_OF_RANGE, observation.source_ns)
         else:
-            image.put(self._index, value, observation.source_ns)
+            doubt = observation.doubt
+            image.put(self._index, value, observation.source_ns, UNCERTAIN if doubt else GOOD)
+            if doubt and not self._doubted:
+                log.warning("%s: %s, so its value is uncertain", self._register.path, doubt)
+            self._doubted = bool(doubt)
 
     def _value(self, text: str) -> Value:
         """Return the register's value.
 
-        Raise ValueError if the text is not a value, OverflowError if it has too few elements.
+        Raise ValueError if the text is not a value, OverflowError if it has another number of elements.
         """
         if self._is_plain and (number := _finite(text)) is not None:
             return number
@@ -170,9 +180,11 @@ class Target:
         if not register.dims:
             return self._scalar(text)
         words = text.split()
-        if len(words) < register.count:
+        if self.item.representation == "TIME_SERIES":
+            words = words[-register.count :]  # the newest
+        if len(words) != register.count:
             raise OverflowError
-        return [self._scalar(word) for word in words[-register.count :]]  # of a time series the newest
+        return [self._scalar(word) for word in words]
 
     def _scalar(self, text: str) -> bool | int | float | str:
         register = self._register

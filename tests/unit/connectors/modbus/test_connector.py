@@ -140,6 +140,29 @@ def test_word_and_byte_order_in_both_directions(
             assert connector.write(encode(register, bool(0x01020304 >> bit & 1), "little")) == [""]
 
 
+def test_a_tag_may_have_its_own_order_of_words_and_bytes(device: Device) -> None:
+    """The tag's keys override those of the source, in both directions."""
+    orders: dict[str, dict[str, str]] = {
+        "AABB CCDD": {},
+        "CCDD AABB": {"word_order": "little"},
+        "BBAA DDCC": {"byte_order": "little"},
+        "DDCC BBAA": {"word_order": "little", "byte_order": "little"},
+    }
+    tags = {name: tag("UDINT", f"holding {10 * at}", **keys) for at, (name, keys) in enumerate(orders.items())}
+    tags["as the source"] = tag("UDINT", "holding 60", byte_order="big")
+    for at, name in enumerate(orders):
+        device.set("holding", 10 * at, [int(word, 16) for word in name.split()])
+    device.set("holding", 60, [0x1122, 0x3344])
+    with connected(device, tags) as (connector, layout):
+        assert values(connector, layout) == dict.fromkeys(orders, 0xAABBCCDD) | {"as the source": 0x11223344}
+        for at, name in enumerate(orders):
+            assert connector.write(encode(find(layout, f"{name}"), 0x01020304, "little")) == [""]
+            sent = bytes.fromhex(name.replace("AA", "01").replace("BB", "02").replace("CC", "03").replace("DD", "04"))
+            assert device.get("holding", 10 * at, 2) == list(struct.unpack(">2H", sent))
+            assert connector.write(encode(find(layout, f"{name}.%X8"), True, "little")) == [""]
+            assert values(connector, layout)[name] == 0x01020304 | 1 << 8
+
+
 def test_scales_and_types_of_the_device(device: Device) -> None:
     device.set("holding", 0, words("hH", -125, 40000))
     tags = {

@@ -6,6 +6,7 @@ import contextlib
 import struct
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -19,15 +20,20 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.connectors.s7.table import RETRY_NS
+from shmio.emulators.emulator import Emulator
 from shmio.emulators.s7 import Fault, S7Server, ServerOptions
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
-from shmio.layout.tags import place_tags
+from shmio.layout.report import Report
+from shmio.layout.s7.address import Area
+from shmio.layout.tags import compile_tags, place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_OUT_OF_RANGE, GOOD, StatusArea
+from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
 
+FIELD = Path(__file__).parents[3] / "field/s7"
 TAGS: dict[str, object] = {
     "bit": {"type": "BOOL", "address": "DB1.DBX0.1"},
     "int": {"type": "INT", "address": "DB1.DBW4"},
@@ -312,3 +318,21 @@ def test_an_answer_to_other_sizes_is_refused() -> None:
     assert [bytes(one.data) for one in pdu.parse_items(frame, [2, 1])] == [b"ab", b"c"]
     with pytest.raises(ConnectorError, match="bytes of data"):
         pdu.parse_items(frame, [1, 2])
+
+
+def test_an_array_of_bits_leaves_the_rest_of_its_last_byte_to_others() -> None:
+    """A horn has the last bit of a byte whose first three bits are lamps."""
+    source = FIELD / "bool_array_neighbours/io.toml"
+    layout = compile_tags(source.name, source.read_bytes(), Report([source.name])).with_statuses()
+    with (
+        reserved_port() as address,
+        Emulator(layout, "idle", address) as plc,
+        connected(layout, address.port) as connector,
+    ):
+        for path, value in {"horn": True, "other": 255, "other2": 255}.items():
+            assert write(connector, layout, path, value) == [""]
+        assert write(connector, layout, "lamps", [True, False, True]) == [""]
+        assert write(connector, layout, "flags", [[True, False, True], [False, True, False]]) == [""]
+        found = values(layout, connector.read())
+        assert (found["horn"], found["other"], found["other2"]) == (True, 253, 250)
+        assert plc._contents.memory[Area.OUTPUT, 0][4] == 0b1000_0101

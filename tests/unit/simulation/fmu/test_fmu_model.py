@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 import zipfile
@@ -21,7 +22,7 @@ from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.layout.values.write import Write
 from shmio.simulation import ModelRunner, load
-from tests.fmus import build, build_oven
+from tests.fmus import build, build_oven, edited
 
 MS = 1_000_000
 STEPS = 200
@@ -76,7 +77,7 @@ def test_variables_become_registers(run: Runner) -> None:
         "trouble": "DINT",
         "runs": "DINT",
         "step": "BOOL",
-        "a%2Fb caption": "STRING[254]",
+        "a%2Fb caption": "WSTRING[254]",
         "phase": "LREAL",
         "calls": "DINT",
     }
@@ -122,9 +123,9 @@ def test_bytes_that_are_no_text_fail_each_step_until_they_are_replaced(run: Runn
     """Otherwise, later steps would be good although the FMU has an older text than the register shows."""
     runner = run("plant3")
     at = find(runner.layout, "text").offset
-    texts = [(b"\xfe\1a", "<a>"), (b"\xfe\xff", ""), (b"\xfe\3a\0b", ""), (b"\xfe\1b", "<b>")]
-    for number, (data, shown) in enumerate(texts):
-        assert runner.write([Write(at, 0, data)]) == [""]
+    texts = [(1, "a", "<a>"), (255, "", ""), (3, "a\0b", ""), (1, "b", "<b>")]
+    for number, (length, text, shown) in enumerate(texts):
+        assert runner.write([Write(at, 0, struct.pack("<HH", 254, length) + text.encode("utf-16-le"))]) == [""]
         for step in (2 * number + 1, 2 * number + 2):
             if shown:
                 assert value(runner, "text_out", runner.step(step * 20 * MS, 20 * MS)) == shown
@@ -338,14 +339,25 @@ XML = "modelDescription.xml"
 def test_descriptions_that_do_not_work_are_refused(
     folder: Path, tmp_path: Path, change: Callable[[str], str], message: str
 ) -> None:
-    file = tmp_path / "x.fmu"
-    with zipfile.ZipFile(folder / "tank2.fmu") as old, zipfile.ZipFile(file, "w") as new:
-        for name in old.namelist():
-            text = change(old.read(name).decode()) if name == XML else old.read(name)
-            new.writestr(name, text)
+    file = edited(folder / "tank2.fmu", tmp_path / "x.fmu", change)
     with pytest.raises(ModelError, match=message) as caught:
         load("x.fmu", tmp_path)
     assert str(caught.value).startswith(f"{file}: ")
+
+
+def test_a_default_export_of_pythonfmu_runs_with_a_warning(folder: Path, tmp_path: Path) -> None:
+    """It states no variability, so that whole numbers, Booleans and texts are continuous, which is not allowed."""
+    file = edited(folder / "tank2.fmu", tmp_path / "x.fmu", lambda xml: xml.replace('variability="discrete"', ""))
+    (notice,) = load(str(file)).notices
+    assert 'The variable "runs"' in notice
+    assert "strict = true" in notice
+    runner = ModelRunner(load(str(file)))
+    runner.connect({"step": True})
+    runner.step(20 * MS, 20 * MS)
+    assert (value(runner, "runs"), value(runner, "a%2Fb caption")) == (1, "small tank")
+    runner.close()
+    with pytest.raises(ModelError, match=r'invalid: The variable "pulses" \(line .*must have variability'):
+        load(str(file), strict=True)
 
 
 @settings(max_examples=60)
