@@ -7,8 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, Final
 
-import msgspec
-
+from shmio.connectors import json_text
 from shmio.connectors.mqtt.faults import ValueFaultError
 from shmio.errors import ValueRangeError
 from shmio.layout import model
@@ -192,7 +191,7 @@ class ValueConverter:
 
 
 def decode_json(payload: bytes) -> Any:
-    """Return the document in a payload.
+    """Return the document in a payload, which may also contain NaN and Infinity.
 
     Raises:
         ValueFaultError: The payload is not JSON.
@@ -201,10 +200,10 @@ def decode_json(payload: bytes) -> Any:
     if not payload:
         raise ValueFaultError(BAD_NO_DATA, "the payload is empty")
     try:
-        return msgspec.json.decode(payload)
+        return json_text.read(payload)
     except RecursionError:
         raise ValueFaultError(BAD_DECODING_ERROR, "the JSON is nested too deeply") from None
-    except (msgspec.MsgspecError, UnicodeDecodeError, ValueError) as error:
+    except ValueError as error:
         raise ValueFaultError(BAD_DECODING_ERROR, f"the payload is not JSON: {printable(str(error))[:100]}") from None
 
 

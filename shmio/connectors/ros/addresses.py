@@ -172,11 +172,13 @@ def extract(message: Any, address: Address) -> Any:
                 BAD_INDEX_RANGE_NO_DATA, f"{address.text}: the array {name!r} has only {len(found)} elements"
             )
         found = found[index]
-    return _folded(found, scopes[-1], address) if step.whole else found
+    return folded(found, scopes[-1], address.text) if step.whole else found
 
 
-def _folded(found: Any, scope: Any, address: Address) -> Any:
+def folded(found: Any, scope: Any, text: str) -> Any:
     """Return a sequence as nested lists if the message that contains it states their sizes, as a MultiArray does.
+
+    ``text`` is the path of the sequence, for messages.
 
     Raises:
         FieldError: The sequence does not have the sizes.
@@ -193,7 +195,7 @@ def _folded(found: Any, scope: Any, address: Address) -> Any:
     pairs: list[tuple[Any, Any]] = [
         (one.get("size"), one.get("stride")) if isinstance(one, dict) else (None, None) for one in dims
     ]
-    wrong = FieldError(BAD_INDEX_RANGE_NO_DATA, f"{address.text}: its layout does not fit its {len(found)} elements")
+    wrong = FieldError(BAD_INDEX_RANGE_NO_DATA, f"{text}: its layout does not fit its {len(found)} elements")
     if any(type(one) is not int or one < 0 for one in (offset, *(one for pair in pairs for one in pair))):
         raise wrong
     sizes = tuple(size for size, _ in pairs)
@@ -227,7 +229,7 @@ def getter(address: Address) -> Callable[[Any], Any]:
                 scope = scope[one]
             found = scope[name]
             if place is None and key is None:
-                return _folded(found, scope, address) if "layout" in scope else found
+                return folded(found, scope, address.text) if "layout" in scope else found
             if type(found) is list and place is not None:
                 return found[place]
             if type(found) is list and key is not None and type(scope[key[0]]) is list:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from shmio.connectors.browsing import Browsed, Offer, Wanted
-from shmio.connectors.ros.addresses import MAX_STEPS, parse
+from shmio.connectors.ros.addresses import MAX_STEPS, FieldError, folded, parse
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, plain
 
 MAX_TEXT: Final = 254
@@ -121,11 +121,23 @@ def _field(
     inner = kind.removesuffix("[]")
     keys = _keys(scopes, path.rpartition(".")[2], len(value))
     if keys is None and inner in PRIMITIVES:
-        yield _offer(names, f"ARRAY[0..{len(value) - 1}] OF {_TYPES[inner]}", f"{prefix}{path}", columns)
+        try:
+            bounds = ", ".join(f"0..{size - 1}" for size in _shape(folded(value, message, path)))
+        except FieldError as error:
+            yield Offer(names, refused=str(error))
+            return
+        yield _offer(names, f"ARRAY[{bounds}] OF {_TYPES[inner]}", f"{prefix}{path}", columns)
         return
     for at, one in enumerate(value):
         step, name = (str(at), str(at)) if keys is None else (f"{keys[0]}={keys[1][at]}", keys[1][at])
         yield from _value(prefix, (*names, name), inner, f"{path}[{step}]", [*scopes, one], columns)
+
+
+def _shape(found: Any) -> Iterator[int]:
+    """Yield the sizes of nested lists."""
+    while isinstance(found, list) and found:
+        yield len(found)
+        found = found[0]
 
 
 def _value(

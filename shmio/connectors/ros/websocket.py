@@ -10,7 +10,6 @@ import functools
 import itertools
 import json
 import logging
-import math
 import re
 import socket
 import struct
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from shmio.config import Address
-from shmio.connectors import tcp
+from shmio.connectors import json_text, tcp
 from shmio.connectors.ros.messages import from_json
 from shmio.errors import ConnectorError
 from shmio.wording import printable
@@ -322,9 +321,7 @@ class Link:
 def decode(text: msgspec.Raw) -> Any:
     """Return the document in a JSON message, which may also contain NaN and Infinity; None if it is not valid JSON."""
     with contextlib.suppress(*_UNREADABLE):
-        return msgspec.json.decode(text)
-    with contextlib.suppress(*_UNREADABLE):
-        return json.loads(bytes(text), parse_float=_number)
+        return json_text.read(text)
     return None
 
 
@@ -337,7 +334,7 @@ def _read(text: bytes) -> _Envelope | None:
     with contextlib.suppress(*_UNREADABLE):
         return _envelope.decode(text)
     with contextlib.suppress(*_UNREADABLE):
-        fields = json.loads(text, parse_float=_number)
+        fields = json_text.read(text)
         if isinstance(fields, dict):
             for name in {"msg", "values"} & fields.keys():
                 fields[name] = msgspec.Raw(json.dumps(fields[name]).encode())
@@ -346,13 +343,6 @@ def _read(text: bytes) -> _Envelope | None:
         if found := _TOPIC.search(text):
             return _Envelope("publish", json.loads(found[1]))
     return None
-
-
-def _number(text: str) -> float:
-    number = float(text)
-    if math.isinf(number):
-        raise ValueError("larger than all numbers")
-    return number
 
 
 def _contains(found: Any, expected: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from typing import Any
 
@@ -69,6 +70,14 @@ def test_an_array_of_another_shape_is_bad() -> None:
         assert (broker.value("a"), broker.status("a").code) == (right, code), given
     broker.publish("u", [[1, 2, 3, 4], [5, 6, 7, 8]])
     assert broker.status("b").code == BAD_INDEX_RANGE_NO_DATA
+
+
+def test_numbers_that_json_does_not_have() -> None:
+    """Python's json writes them."""
+    broker = Broker({"a": ("LREAL", "t $.a"), "b": ("INT", "t $.b"), "c": ("STRING[9]", "t $.c")})
+    broker.publish("t", {"a": -math.inf, "b": math.nan, "c": "NaN"})
+    assert (broker.value("a"), broker.value("c")) == (-math.inf, "NaN")
+    assert [broker.status(name).code for name in "abc"] == [GOOD, BAD_TYPE_MISMATCH, GOOD]
 
 
 def test_times(caplog: pytest.LogCaptureFixture) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from shmio.connectors.browsing import Wanted
+from shmio.connectors.ros.browse import Seen, browsed
 from shmio.connectors.ros.commands import plan
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -77,6 +79,17 @@ def test_shapes() -> None:
     for found, code in (*nested, ([1, [2]], BAD_INDEX_RANGE_NO_DATA), ([TABLE[0], [4, 5, [6]]], BAD_TYPE_MISMATCH)):
         robot.publish("/u", {"inner": {"data": found}})
         assert robot.status("u").code == code, found
+
+
+def test_browsing_offers_the_shape_that_a_layout_states() -> None:
+    for message, kind in (
+        (multi(FLAT, (2, 6), (3, 3)), "ARRAY[0..1, 0..2] OF LREAL"), (multi(FLAT), "ARRAY[0..5] OF LREAL"),
+        (multi(FLAT, (6, 6)), "ARRAY[0..5] OF LREAL"), (multi(FLAT, (3, 6), (3, 3)), ""),
+    ):  # fmt: skip
+        seen = Seen("std_msgs/Float64MultiArray", published=True)
+        seen.message = message
+        (offer,) = browsed({"/m": seen}, Wanted(), "").offers
+        assert (offer.type, bool(offer.refused)) == (kind, not kind), message
 
 
 def test_a_write_does_not_contradict_the_layout_of_the_last_message() -> None:
