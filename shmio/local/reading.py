@@ -133,7 +133,7 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
     if frame is None:
         return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = block.now_ns()
-    quality, reason = frame.assess(block.stale_ns, now_ns) if aged else (frame.quality, frame.reason)
+    quality, reason = block.assess(frame, now_ns) if aged else (frame.quality, frame.reason)
     source_ns = frame.source_ns
     is_injected = injected(block, (register,), frame)
     value = codec(register, block.byte_order).decode(frame.image) if source_ns else None

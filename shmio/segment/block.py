@@ -122,6 +122,9 @@ def read_frames(ring: Ring, first: int, count: int) -> list[Frame]:
 
 Entry = TypeVar("Entry")
 
+CLOCK_RESOLUTION_NS: Final = 1_000_000
+"""By how much the clocks of two processors may differ, in ns, with a wide margin."""
+FAR_NS: Final = (1 << 63) - 1
 _POLL_NS: Final = 1_000_000_000
 """Interval in ns at which a waiting reader checks whether its block has been retired.
 
@@ -401,9 +404,28 @@ class Block:
             return self.playhead.now_ns()
         return self.clock.now_ns() if self.attributes.stepped else time.monotonic_ns()
 
-    def assess(self, frame: Frame) -> tuple[Quality, str]:
-        """Return a frame's present quality, and the reason if it is not good."""
-        return frame.assess(self.stale_ns, self.now_ns())
+    def assess(self, frame: Frame, now_ns: int | None = None) -> tuple[Quality, str]:
+        """Return a frame's present quality, and the reason if it is not good.
+
+        Args:
+            frame: The frame.
+            now_ns: The present time, from :meth:`now_ns`; None: read the clock.
+        """
+        if now_ns is None:
+            now_ns = self.now_ns()
+        if frame.publish_ns > now_ns and frame.quality is not Quality.BAD and self.playhead is None:
+            ahead_ns = frame.publish_ns - self._latest_ns()
+            if ahead_ns > 0:
+                return Quality.BAD, f"its publish time is {ahead_ns / 1e9:.3g} s in the future, so its age is unknown"
+        return frame.assess(self.stale_ns, now_ns)
+
+    def _latest_ns(self) -> int:
+        """Return the latest publish time that a frame can have now, also in the eyes of another process."""
+        if not self.attributes.stepped:
+            return time.monotonic_ns() + CLOCK_RESOLUTION_NS
+        if self.clock.step_request().virtual:  # a restored snapshot may have turned time back
+            return FAR_NS
+        return self.clock.now_ns() + max(self.period_ns, CLOCK_RESOLUTION_NS)
 
     def came_with(self, frame: Frame, step: int) -> bool:
         """Return whether a frame belongs to the step of virtual time with this number, or to a later one.

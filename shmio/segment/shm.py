@@ -11,6 +11,7 @@ import fcntl
 import grp
 import mmap
 import os
+import pwd
 import struct
 from contextlib import suppress
 
@@ -77,7 +78,7 @@ class SharedObject:
 
         Raises:
             FileNotFoundError: There is no object of this name.
-            SegmentError: This user may not open the object.
+            SegmentError: This user may not open the object, or does not trust its owner.
         """
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", 0, read_only=not writable)
@@ -89,7 +90,13 @@ class SharedObject:
             ) from None
         except (posix_ipc.Error, OSError, ValueError) as error:
             raise SegmentError(f"cannot open shared memory {name}: {error}") from None
-        return cls(name, memory.fd, writable=writable)
+        shared = cls(name, memory.fd, writable=writable)
+        try:
+            _require_trusted(name, os.fstat(memory.fd))
+        except SegmentError:
+            shared.close()
+            raise
+        return shared
 
     def again(self) -> SharedObject:
         """Open a private object once more, with locks of its own."""
@@ -201,6 +208,35 @@ class SharedObject:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, unlock)
         os.close(self._fd)
         self._fd = -1
+
+
+SERVICE_USER = "shmio"
+"""The user of the service of the Debian package and of the image, whom every user trusts."""
+
+
+def _require_trusted(name: str, status: os.stat_result) -> None:
+    """Refuse an object that a user has created whom this process does not trust.
+
+    Everyone may create files in /dev/shm, also one with the name of an instance, to show wrong values
+    or to let readers crash. A trusted object belongs to root, to this user, to the service, or to a
+    user who has given it to a group of this user, as ``instance.group`` does: only members of a group
+    can do that. The group ``root`` does not count, because it is nobody's choice.
+    """
+    if status.st_uid in (0, os.geteuid()):
+        return
+    shared = status.st_mode & 0o040 and not status.st_mode & 0o022 and status.st_gid != 0
+    if shared and status.st_gid in (os.getegid(), *os.getgroups()):
+        return
+    try:
+        owner = pwd.getpwuid(status.st_uid).pw_name
+    except KeyError:
+        owner = str(status.st_uid)
+    if owner == SERVICE_USER:
+        return
+    raise SegmentError(
+        f"segment {name} belongs to user {owner}, so its values cannot be trusted; run the command as {owner}, share "
+        f"the instance by instance.group, or, if it is not yours, remove it as root: rm {DIRECTORY}/{name}"
+    )
 
 
 def _private_memory(name: str, size: int) -> mmap.mmap:

@@ -19,6 +19,10 @@ _OWN: Final = "_beside_configuration"
 """Suffix of the names of modules in the folder that have the names of installed ones."""
 
 
+_FOLDERS: Final[set[Path]] = set()
+"""The folders from which models were loaded."""
+
+
 def load(text: str, folder: str | Path | None = None, *, strict: bool = False) -> type[Model]:
     """Import a model's class, or make one of an FMU.
 
@@ -61,13 +65,18 @@ def _is_model(value: object) -> TypeGuard[type[Model]]:
 
 
 def _module(name: str, folder: str | Path | None) -> ModuleType:
-    if folder is not None and str(folder) not in sys.path:
-        sys.path.append(str(folder))  # last, so that no file in the folder hides a module that others import
+    if folder is not None:
+        _FOLDERS.add(Path(folder).resolve())
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))  # last, so that no file in the folder hides a module that others import
     own = None if folder is None else _beside(name, Path(folder))
     imported = name
     try:
-        if own is not None and not _is_imported_as(name.partition(".")[0], own):
-            imported = _import_file(name, own)
+        if own is not None:
+            other = _origin(name.partition(".")[0])
+            if other != own:
+                installed = other is None or _FOLDERS.isdisjoint(other.parents)
+                imported = _import_file(name, own, _OWN if installed else "")
         return importlib.import_module(imported)
     except ModuleNotFoundError as error:
         if error.name is not None and f"{imported}.".startswith(f"{error.name}."):
@@ -87,22 +96,23 @@ def _beside(name: str, folder: Path) -> Path | None:
     return next((file.resolve() for file in files if file.is_file()), None)
 
 
-def _is_imported_as(first: str, file: Path) -> bool:
-    """Return whether ``import first`` gives the module of this file."""
+def _origin(first: str) -> Path | None:
+    """Return the file of the module that ``import first`` gives; None if it has no file."""
     try:
         spec = importlib.util.find_spec(first)
     except ValueError:  # a module without a spec, such as __main__
-        return False
-    return spec is not None and spec.origin is not None and Path(spec.origin).resolve() == file
+        return None
+    return None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin).resolve()
 
 
-def _import_file(name: str, file: Path) -> str:
-    """Import the module or package in a file under a name that no installed module has, and return that name.
+def _import_file(name: str, file: Path, suffix: str) -> str:
+    """Import the module or package in a file, and return its name.
 
-    The installed module of the same name stays what others import.
+    With a suffix, it gets a name that no installed module has, and the installed module of the same
+    name stays what others import.
     """
     first, dot, rest = name.partition(".")
-    own = f"{first}{_OWN}"
+    own = f"{first}{suffix}"
     if getattr(sys.modules.get(own), "__file__", None) != str(file):
         package = [str(file.parent)] if file.name == "__init__.py" else None
         spec = importlib.util.spec_from_file_location(own, file, submodule_search_locations=package)

@@ -136,7 +136,7 @@ class _Upstream:
             if frame is None:
                 return None, self._keeps(NO_DATA)
             now_ns = block.now_ns() if before_ns is None or not self._is_stepped else before_ns
-            quality, reason = frame.assess(block.stale_ns, now_ns)
+            quality, reason = block.assess(frame, now_ns)
         except SegmentError as error:
             return None, f": {error}"
         if quality is Quality.BAD:

@@ -15,7 +15,7 @@ from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment, attach
 from shmio.local.subscription import Subscription
 from shmio.model.values import Quality
-from shmio.segment import BlockSpec, BlockWriter, Segment, Stamp
+from shmio.segment import BlockSpec, BlockWriter, Segment, Stamp, block
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
 LONG_NS = 3600 * 10**9
@@ -99,7 +99,10 @@ def test_a_source_that_falls_silent_is_bad(segment: Segment, cell: Attachment) -
     assert [(one.value, one.quality) for one in update.readings] == [(1, Quality.BAD)]
 
 
-def test_a_source_whose_next_update_is_not_due_is_not_stale(segment: Segment, cell: Attachment) -> None:
+def test_a_source_whose_next_update_is_not_due_is_not_stale(
+    segment: Segment, cell: Attachment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block, "CLOCK_RESOLUTION_NS", 2 * LONG_NS)  # so that a frame may stay good
     writer = segment.writer("tired")
     publish(writer, 1, 1, 1)
     with cell.subscribe("tired/a", max_rate_hz=1) as updates:

@@ -11,7 +11,8 @@ import pytest
 from shmio.errors import FormatError
 from shmio.layout.model import Layout, Register
 from shmio.model.clock import Clock, ClockMode
-from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from shmio.model.values import Provenance
+from shmio.segment import Attributes, Block, BlockSpec, Frame, ProcessSpec, Quality, Segment
 from shmio.segment.clock import time_lock
 from shmio.segment.header import SectionKind, read_sections, table_state
 
@@ -218,3 +219,28 @@ def test_a_wait_returns_the_value_of_the_doorbell(segment: Segment) -> None:
     assert bell.wait(before, 1) == before  # no ring within a nanosecond
     bell.ring()
     assert bell.wait(before) == bell.value() != before
+
+
+def test_a_frame_from_the_future_is_bad(segment: Segment) -> None:
+    """In virtual time, which may go back, no frame of a stepped source is from the future."""
+    frame = Frame(1, 1, 0, 0, 1, 1, Quality.GOOD, Provenance.LIVE, 0, 0, "", bytes(4), None)
+    sim, cell = segment.blocks["sim"], segment.blocks["cell"]
+
+    def quality(block: Block, publish_ns: int) -> Quality:
+        found, reason = block.assess(frame._replace(publish_ns=publish_ns))
+        assert ("in the future" in reason) is (found is Quality.BAD), reason
+        return found
+
+    for block in (sim, cell):
+        assert quality(block, time.monotonic_ns()) is Quality.GOOD
+        assert quality(block, time.monotonic_ns() + 10**9) is Quality.BAD
+        assert quality(block, (1 << 63) - 1) is Quality.BAD
+        bad = frame._replace(publish_ns=(1 << 63) - 1, quality=Quality.BAD, reason="no answer")
+        assert block.assess(bad) == (Quality.BAD, "no answer")
+    assert segment.shared.try_lock(time_lock(segment.header))
+    segment.clock.write(STATE)
+    after_ns = segment.clock.monotonic_ns(STATE.time_ns)
+    assert sim.now_ns() < after_ns
+    assert quality(sim, after_ns) is Quality.GOOD
+    assert quality(sim, after_ns + 10**9) is Quality.GOOD, "a restored snapshot may turn time back"
+    assert quality(cell, time.monotonic_ns() + 10**9) is Quality.BAD

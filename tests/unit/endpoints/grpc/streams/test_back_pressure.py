@@ -15,6 +15,7 @@ from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import Outbox, StateLane
 from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from shmio.segment import block as block_module
 from shmio.segment.block import Stamp
 from tests.unit.endpoints.grpc.test_grpc import STEP
 from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
@@ -289,8 +290,11 @@ def test_skipped_frames_do_not_make_a_source_stale(soon_stale: Segment) -> None:
     follow(soon_stale, test, True)
 
 
-def test_a_gap_between_two_frames_read_at_once_counts_as_stale(segment: Segment) -> None:
+def test_a_gap_between_two_frames_read_at_once_counts_as_stale(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The publication time of the next frame counts, not the time at which the feed read it."""
+    monkeypatch.setattr(block_module, "CLOCK_RESOLUTION_NS", 10 * STALE_NS)  # its frame comes too early
 
     async def test(followed: Followed) -> None:
         (stream,), block = followed.streams, segment.blocks["cell"]
