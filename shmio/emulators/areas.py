@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Final
 
@@ -11,7 +11,7 @@ from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area, is_of_cpu, parse
 from shmio.layout.s7.conversion import Conversion
-from shmio.layout.values.write import apply
+from shmio.layout.values.write import apply, changed_bits
 
 Place = tuple[Area, int]
 """An area, and the number of the data block; 0 for other areas."""
@@ -81,7 +81,7 @@ class TableMemory:
                     continue
                 if given is (one.register.initial is not None) and (given or _place(one) not in present):
                     with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
-                        _store(one, frame, memory)
+                        _store(one, frame, b"\xff" * one.register.size, memory)
 
     def load(self, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
         """Copy the registers' values from the memory to an image, except for invalid values."""
@@ -92,16 +92,15 @@ class TableMemory:
                 frame[offset : offset + len(found)] = found
 
     def store(self, before: bytes, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-        """Copy the registers that differ between ``before`` and ``frame`` to the memory if it can hold their values."""
-        for one in self._changed(before, frame):
-            with suppress(ValueError, ValueRangeError):
-                _store(one, frame, memory)
+        """Copy the values that differ between ``before`` and ``frame`` to the memory if it can hold them.
 
-    def _changed(self, before: bytes, frame: bytearray) -> Iterator[Conversion]:
+        Of an array, copy only the elements that differ.
+        """
         for one in self._conversions:
             start, stop = one.register.offset, one.register.offset + one.register.size
             if before[start:stop] != frame[start:stop]:
-                yield one
+                with suppress(ValueError, ValueRangeError):
+                    _store(one, frame, changed_bits(one.register, before, frame), memory)
 
 
 def _place(one: Conversion) -> Place:
@@ -113,8 +112,8 @@ def _key(one: Conversion) -> tuple[object, ...]:
     return one.register.path, one.register.type, one.register.dims, one.register.address
 
 
-def _store(one: Conversion, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-    """Store a register of an image.
+def _store(one: Conversion, frame: bytearray, bits: bytes, memory: Mapping[Place, bytearray]) -> None:
+    """Store some bits of a register of an image.
 
     Raises:
         ValueError: The controller cannot hold the value.
@@ -122,5 +121,5 @@ def _store(one: Conversion, frame: bytearray, memory: Mapping[Place, bytearray])
     """
     register, area = one.register, memory[_place(one)]
     own = bytes(frame[register.offset : register.offset + register.size])
-    for write in list(one.device_writes(own, b"\xff" * register.size)):
+    for write in list(one.device_writes(own, bits)):
         apply(write._replace(offset=one.start + write.offset), area)

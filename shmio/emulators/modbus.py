@@ -89,11 +89,18 @@ class _Place:
                 flat.append(self._words.decode(self._packed.pack(*entries[at : at + self.width])))
         return nest(flat, self.register.shape) if self.register.dims else flat[0]
 
-    def write(self, entries: list[int], value: Any) -> None:
-        """Store a value of the register. Raise ValueError if the device's type cannot hold it."""
-        register = self.register
-        flat = flatten(value, register.shape, register.path) if register.dims else (value,)
-        for at, one in zip(self._starts, flat, strict=True):
+    def write(self, entries: list[int], value: Any, before: Any = None) -> None:
+        """Store those elements of the register's value that differ from the value ``before``, if there is one.
+
+        Raises:
+            ValueError: The device's type cannot hold an element.
+
+        """
+        flat = self._flat(value)
+        old = [None] * len(flat) if before is None else self._flat(before)
+        for at, one, was in zip(self._starts, flat, old, strict=True):
+            if one == was:
+                continue
             if self._words is None:
                 mask = 1 << (self.address.bit or 0)
                 entries[at] = entries[at] & ~mask | (mask if one else 0)
@@ -102,6 +109,10 @@ class _Place:
                     zip(self._words.masks, self._packed.unpack(self._words.encode(one)), strict=True), at
                 ):
                     entries[place] = entries[place] & ~mask | word & mask
+
+    def _flat(self, value: Any) -> list[Any]:
+        register = self.register
+        return list(flatten(value, register.shape, register.path)) if register.dims else [value]
 
 
 class _TableImage:
@@ -152,14 +163,14 @@ class _TableImage:
                 own.encode_into(place.read(words[place.where]), frame)
 
     def store(self, before: bytes, frame: bytearray, words: Words) -> None:
-        """Copy the changed values of an image to the device."""
-        self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in self._spans])
+        """Copy the changed values of an image to the device; of an array, only the changed elements."""
+        self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in self._spans], before)
 
-    def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool]) -> None:
+    def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool], before: bytes | None = None) -> None:
         for place, own, one in zip(self.places, self._codecs, chosen, strict=True):
             if one:
                 with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
-                    place.write(words[place.where], own.decode(frame))
+                    place.write(words[place.where], own.decode(frame), None if before is None else own.decode(before))
 
 
 class ModbusEmulator:

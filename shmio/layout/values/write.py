@@ -93,6 +93,21 @@ def element_bits(register: Register) -> bytes:
     return bytes(mask)
 
 
+def changed_bits(register: Register, before: bytes | bytearray, after: bytes | bytearray) -> bytes:
+    """Return a mask of ``register.size`` bytes with all bits of each element that differs between two images."""
+    start, stop = register.offset, register.offset + register.size
+    old, new = before[start:stop], after[start:stop]
+    own = element_bits(register)
+    if register.type == "BOOL":
+        return bytes((one ^ other) & bits for one, other, bits in zip(old, new, own, strict=True))
+    mask = bytearray(register.size)
+    size, stride = register.element.size, register.element.stride
+    for at in range(0, register.count * stride, stride):
+        if old[at : at + size] != new[at : at + size]:
+            mask[at : at + size] = own[at : at + size]
+    return bytes(mask)
+
+
 def covering(registers: Iterable[Register], size: int, *, padding: bool = True) -> bytes:
     """Return an image of ``size`` bytes in which the bits of these registers are set; with or without padding."""
     mask = bytearray(size)
