@@ -396,7 +396,7 @@ def decode_request(data: bytes) -> CommandRequest:
     """
     try:
         request = msgspec.msgpack.decode(data, type=CommandRequest)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(f"the message is not a command: {error}") from None
     injection = request.injection
     if injection is not None and not request.writes:
@@ -414,22 +414,22 @@ def decode_request(data: bytes) -> CommandRequest:
 
 
 def outcomes_of(data: bytes) -> int:
-    """Return the number of outcomes in the reply to a command that cannot be decoded; 0 if it is no command.
+    """Return the number of outcomes in the reply to a message that cannot be decoded as a command.
 
-    For example, a newer version of shmio may have sent it.
+    For example, a newer version of shmio may have sent it. If it has no items that can be counted, there is one.
     """
     try:
         found = msgspec.msgpack.decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return 0
+        return 1
     if not isinstance(found, dict):
-        return 0
+        return 1
     injection = found.get("injection")
     if isinstance(injection, dict):
         items = injection.get("items") if injection.get("kind") == "shadow" else [None]
     else:
         items = found.get("writes")
-    return len(items) if isinstance(items, list) and len(items) <= MAX_ITEMS else 0
+    return len(items) if isinstance(items, list) and 0 < len(items) <= MAX_ITEMS else 1
 
 
 def _check_injection(injection: InjectionRequest) -> None:

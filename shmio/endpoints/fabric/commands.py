@@ -270,8 +270,8 @@ class CommandReceiver:
         except (ConfigError, ValueError) as error:
             self.refused += 1
             log.warning("a command of %s to source %s is malformed: %s", sender[:120], source, error)
-            if reply and (count := outcomes_of(data)):
-                why = f"cell {self._cell} does not understand the command: {error}"
+            if reply:
+                count, why = outcomes_of(data), f"cell {self._cell} does not understand the command: {error}"
                 self._answer(reply, CommandReply([str(OutcomeKind.REJECTED)] * count, [why] * count))
             return
         if not reply:  # nobody would know the outcome

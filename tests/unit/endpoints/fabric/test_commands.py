@@ -14,7 +14,6 @@ from typing import Any
 import msgspec
 import nats
 import pytest
-from nats.errors import TimeoutError as NatsTimeoutError
 
 from shmio.audit import trail
 from shmio.audit.file import AuditSettings
@@ -242,15 +241,15 @@ async def test_registers_that_are_not_published_are_not_written(
 async def test_malformed_commands_are_counted(segment: Segment, server: NatsServer, plant: Plant) -> None:
     request = CommandRequest(1 << 62, 7, LAYOUT.hash[:8], [WriteItem(0, 0x81, b"\1")])
     async with commander(segment, server.url) as client:
-        hostile = [b"", b"\xff" * 100, b"\x81\xa6writes\xdd\xff\xff\xff\xff"]
-        for data in hostile:
-            with pytest.raises(NatsTimeoutError):
-                await client.send(data, timeout_s=0.05)
-        await until(lambda: client.uplink.commands.refused == len(hostile))
+        deep = b"\x81\xa1x" + b"\x91" * 100_000 + b"\xc0"
+        huge = msgspec.msgpack.encode({"writes": [0] * 5000})
+        hostile = [b"", b"\xff" * 100, b"\x81\xa6writes\xdd\xff\xff\xff\xff", b"{}", deep, huge]
+        hostile.append(msgspec.msgpack.encode({"writes": []}))
         newer = msgspec.msgpack.encode({"injection": {"kind": "pause", "number": 1}})
-        for data in (encode_command(request), newer):
+        for data in (*hostile, encode_command(request), newer):
             reply = decode_reply(await client.send(data), 1)
             assert (reply.outcomes, CELL in reply.reasons[0]) == (["rejected"], True)
+        assert client.uplink.commands.refused == len(hostile) + 2
         assert (await client.write((0, 0, b"\1"))).outcomes == ["written"], "others are served"
 
 
