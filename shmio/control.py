@@ -84,21 +84,39 @@ def socket_path(instance: str) -> str:
         ControlError: No folder can be used: it belongs to another user, or the path is too long.
 
     """
-    uid = os.getuid()
+    return runtime_file(f"{instance}.sock", "the control socket")
+
+
+def runtime_folders() -> list[Path]:
+    """Return the folders that this user's processes may share while they run; the first that can be used is."""
     given = os.environ.get("XDG_RUNTIME_DIR")
     folders = [Path(given) / "shmio"] if given and Path(given).is_absolute() else []
-    folders += [Path(f"/run/user/{uid}/shmio"), Path(f"/tmp/shmio-{uid}")]  # noqa: S108  made with care below
+    uid = os.getuid()
+    return [*folders, Path(f"/run/user/{uid}/shmio"), Path(f"/tmp/shmio-{uid}")]  # noqa: S108  made with care below
+
+
+def runtime_file(name: str, purpose: str) -> str:
+    """Return the path of a file in the first of :func:`runtime_folders` that can be used, and create that folder.
+
+    Args:
+        name: Name of the file. The path also suits a socket.
+        purpose: What the file is, for messages.
+
+    Raises:
+        ControlError: No folder can be used: it belongs to another user, or the path is too long.
+
+    """
     refused = []
-    for folder in folders:
-        path = folder / f"{instance}.sock"
+    for folder in runtime_folders():
+        path = folder / name
         if len(os.fsencode(path)) > MAX_PATH_BYTES:
             refused.append(f"{folder}: the path is longer than {MAX_PATH_BYTES} bytes")
             continue
-        reason = _prepare(folder, uid)
+        reason = _prepare(folder, os.getuid())
         if reason is None:
             return str(path)
         refused.append(f"{folder}: {reason}")
-    raise ControlError(f"no folder can be used for the control socket ({'; '.join(refused)})")
+    raise ControlError(f"no folder can be used for {purpose} ({'; '.join(refused)})")
 
 
 def emulator_socket_path(control: str, name: str) -> str:

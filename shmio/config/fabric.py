@@ -16,6 +16,8 @@ from shmio.wording import plain_text, unknown
 PORT: Final = 4222
 LISTEN: Final = f"127.0.0.1:{PORT}"
 """Address at which the embedded server listens if the configuration gives no other."""
+STORE_MB: Final = 2000.0
+"""Maximum size in MB of what the embedded server keeps on the disk beside the history of its own cell."""
 SCHEMES: Final = ("nats", "tls")
 ROLES: Final = ("read", "write", "inject")
 """Roles of the cells that send commands."""
@@ -42,7 +44,7 @@ def check_fabric(config: Config) -> None:
         _check_external(fabric)
     if fabric.cell is None:
         for key in ("rule", "allow", "history"):
-            if getattr(fabric, key):
+            if getattr(fabric, key) and not (key == "allow" and fabric.embedded):
                 raise ConfigError(f"fabric.{key}: this section needs fabric.cell, the name under which to publish")
     for index, one in enumerate(fabric.allow):
         _check_allow(f"fabric.allow[{index}]", one)
@@ -67,10 +69,15 @@ def _check_embedded(fabric: Fabric) -> None:
         raise ConfigError("fabric.tls: the embedded server needs certificate and key")
     if not (address.loopback or tls or fabric.insecure):
         raise ConfigError(f"fabric.listen: {plain_text(text, _REMEDY)}")
+    if fabric.store_mb is not None and fabric.history is not None and fabric.store_mb <= fabric.history.keep_mb:
+        raise ConfigError(
+            f"fabric.store_mb: {fabric.store_mb:g} MB have no room for the registry and the history of "
+            f"{fabric.history.keep_mb:g} MB; raise it, or lower fabric.history.keep_mb"
+        )
     if fabric.credentials is not None:
         raise ConfigError(
-            "fabric.credentials: the embedded server asks for no credentials; remove this key, or run a NATS server "
-            "of your own"
+            "fabric.credentials: the embedded server knows the processes of its own instance; remove this key, or run "
+            "a NATS server of your own"
         )
 
 
@@ -81,10 +88,11 @@ def _check_external(fabric: Fabric) -> None:
         address = server_address(key, url, "in fabric.credentials", ', or "embedded"')
         if not (address.loopback or fabric.tls or fabric.insecure or url.startswith("tls:")):
             raise ConfigError(f"{key}: shmio would send plain text over the network to {address}; {_REMEDY}")
-    if fabric.listen is not None:
-        raise ConfigError(
-            f'fabric.listen: this key is only for server = "embedded", but server is {fabric.server!r}; remove it'
-        )
+    for key in ("listen", "store_mb"):
+        if getattr(fabric, key) is not None:
+            raise ConfigError(
+                f'fabric.{key}: this key is only for server = "embedded", but server is {fabric.server!r}; remove it'
+            )
 
 
 def server_address(key: str, url: str, credentials: str, others: str = "") -> Address:
@@ -135,6 +143,8 @@ def resolve_fabric(fabric: Fabric, config: Config) -> None:
     """Make the paths in the section absolute, and set the default address of the embedded server."""
     if fabric.embedded:
         fabric.listen = fabric.listen or LISTEN
+        kept = 0.0 if fabric.history is None else fabric.history.keep_mb
+        fabric.store_mb = fabric.store_mb or STORE_MB + kept
     fabric.directory = str(config.path(fabric.directory))
     if fabric.credentials is not None:
         fabric.credentials = str(config.path(fabric.credentials))

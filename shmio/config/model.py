@@ -436,13 +436,14 @@ class Fabric(Section):
     """``[fabric]``: the connection to the NATS servers that join instances on many hosts.
 
     With ``cell``, the instance is published under this name. Sources with ``connector = "fabric"``
-    use the same connection. ``listen`` and ``directory`` are for the embedded server.
+    use the same connection. ``listen``, ``directory`` and ``store_mb`` are for the embedded server.
     """
 
     server: Text | Texts
     cell: Text | None = None
     listen: Text | None = None
     directory: Text = "fabric"
+    store_mb: Annotated[float, Meta(gt=0, le=1e9)] | None = None
     insecure: bool = False
     tls: MqttTls | None = None
     credentials: Text | None = None

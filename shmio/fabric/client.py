@@ -1,4 +1,4 @@
-"""The NATS client, changed: it leaves a dead connection at once, flushes reliably, and insists on TLS.
+"""The NATS client, changed: it leaves a dead connection at once, flushes reliably, and insists on TLS and a version.
 
 Import this module only when nats-py is installed.
 """
@@ -12,6 +12,8 @@ from typing import Final
 from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError, Error
 
+from shmio.fabric.own_seed import find_seed
+from shmio.fabric.server_version import version_fault
 from shmio.fabric.tasks import end
 
 CLOSE_S: Final = 1.0
@@ -39,6 +41,8 @@ class FabricClient(Client):
 
     refused = ""
     """What the server has last refused to this user, in its words and in lower case; empty if nothing."""
+    own: bool | None = False
+    """Whether to use the seed of this user's embedded servers: None: if there is one; True: connect only with one."""
 
     async def confirm(self) -> None:
         """Wait until the server has all that was sent so far.
@@ -76,13 +80,31 @@ class FabricClient(Client):
         await super()._connect_to_server(s)
 
     def _connect_command(self) -> bytes:
-        """Refuse a server without TLS if TLS is required: the library would continue in plain text."""
+        """Refuse servers that are too old, or without TLS if TLS is required: the library would continue in plain text.
+
+        A new server of this user may have a new seed, so each attempt to connect reads it.
+        """
         writer = getattr(self._transport, "_io_writer", None)
         encrypted = isinstance(writer, asyncio.StreamWriter) and writer.get_extra_info("ssl_object") is not None
         if self.options.get("tls") and not encrypted:
             self._abort()
             raise Error("the server does not offer TLS, which this connection requires; connect to a server with TLS")
+        if fault := version_fault(str(self._server_info.get("version", ""))):
+            self._abort()
+            raise Error(fault)
+        if self.own is not False:
+            self._use_own_seed()
         return bytes(super()._connect_command())
+
+    def _use_own_seed(self) -> None:
+        place = None if self._current_server is None else self._current_server.uri
+        seed = None if place is None or place.hostname is None else find_seed(place.hostname, place.port or 0)
+        if seed is None and self.own:
+            self._abort()
+            raise Error("there is no seed of this user for the server; is it another user's server?")
+        self._nkeys_seed_str, self._auth_configured = seed, seed is not None
+        if seed is not None:
+            self._setup_nkeys_seed_connect()
 
     async def _send_ping(self, future: asyncio.Future[bool] | None = None) -> None:
         """Send a ping behind all that waits to be sent: the library's ping overtakes it, so flush() ends too soon."""

@@ -15,9 +15,11 @@ import msgspec
 
 from shmio.config.address import Address
 from shmio.config.credentials import read_secret
+from shmio.config.fabric import server_address
 from shmio.config.model import Fabric, MqttTls
 from shmio.config.tls import client_context
 from shmio.errors import ConfigError, RemoteError
+from shmio.fabric.own_seed import find_seed
 from shmio.fabric.tasks import end
 from shmio.libraries import library
 
@@ -36,6 +38,10 @@ RETRY_S: Final = 0.5
 """Wait between two attempts to connect again, in s."""
 MAX_CREDENTIALS_BYTES: Final = 1 << 16
 MAX_REASONS: Final = 32
+INBOX: Final = "_INBOX"
+"""Beginning of the subjects at which clients without credentials receive replies."""
+OWN_INBOX: Final = f"{INBOX}.own"
+"""The same for the processes of an embedded server's user. No others may subscribe to it."""
 """Maximum number of reasons that are remembered because they were logged."""
 
 FARM: Final = "shmio_farm"
@@ -66,6 +72,8 @@ class Access(msgspec.Struct, frozen=True):
         pinned: PEM file with the certificate of the instance's own server, the only one to trust;
             None: an authority must have issued the server's certificate.
         options: True if options of a command name the files, instead of keys of ``[fabric]``.
+        own: True for the processes of an instance that runs the server. Other clients without
+            credentials use the seed of this user's own server, too, if it is there.
 
     """
 
@@ -74,18 +82,19 @@ class Access(msgspec.Struct, frozen=True):
     credentials: str | None = None
     pinned: str | None = None
     options: bool = False
+    own: bool = False
 
     @classmethod
-    def of(cls, fabric: Fabric) -> Access:
-        """Return the access to the servers of a checked section."""
+    def of(cls, fabric: Fabric, *, process: bool = False) -> Access:
+        """Return the access to the servers of a checked section, for a process of the instance or another client."""
         if not fabric.embedded:
             return cls(tuple(fabric.servers), fabric.tls, fabric.credentials)
         listen = Address.parse(str(fabric.listen))
         url = f"nats://{listen.here}"
         if fabric.tls is None:
-            return cls((url,))
+            return cls((url,), own=process)
         shown = fabric.tls if fabric.tls.ca is not None else None  # the server asks its clients for certificates
-        return cls((url,), shown, pinned=fabric.tls.certificate)
+        return cls((url,), shown, pinned=fabric.tls.certificate, own=process)
 
     def __str__(self) -> str:
         return ", ".join(self.servers)
@@ -160,6 +169,10 @@ async def connect(
         **read_credentials(access),
     }
     client = FabricClient()
+    if access.credentials is None:
+        client.own = access.own or None
+        if access.own or any(find_seed(*_host(server)) for server in access.servers):
+            options["inbox_prefix"] = OWN_INBOX
     try:
         await client.connect(**options)
     except asyncio.CancelledError:  # the library would leave its connection open
@@ -202,6 +215,11 @@ async def connect_or_stop(
     finally:
         await end(stopping)
         await end(connecting)
+
+
+def _host(url: str) -> tuple[str, int]:
+    address = server_address("server", url, "")
+    return address.host, address.port
 
 
 def is_stored(message: Msg) -> bool:
@@ -323,7 +341,7 @@ def inbox_prefix(key: str) -> str:
 
     Each user has another one, so that a server can keep a user from reading the replies to others.
     """
-    return f"_INBOX.{key}"
+    return f"{INBOX}.{key}"
 
 
 class _Attempts:
@@ -406,15 +424,18 @@ def refusal(access: Access, text: str, cell: object = None) -> str:
     who = "this user" if access.credentials is None else f"the user of the credentials in {access.credentials}"
     subject = found["subject"]
     parts = subject.split(".")
+    unknown = access.credentials is None  # to a server that an instance runs, it need not be
     if subject.lower().startswith("$js."):
-        return f"{who} may not {_refused_request(subject.lower())}"
+        more = "; if an instance runs the server, be its user on its host" if unknown else ""
+        return f"{who} may not {_refused_request(subject.lower())}{more}"
     if parts[0] == "shmio" and len(parts) > 5:
         own = parts[6:9] if parts[5] == "command" and found["verb"] == "publish" else parts[1:4]
     elif parts[0].lower() == "$kv" and len(parts) == 5:
         own = parts[2:5]
     else:
         return f"{who} may not {'publish to' if found['verb'] == 'publish' else 'subscribe to'} {subject}"
-    return f"{who} may not publish as {cell or '.'.join(own)}; use the seed of this cell"
+    more = "; if an instance runs the server, name the cell in its [[fabric.allow]]" if unknown else ""
+    return f"{who} may not publish as {cell or '.'.join(own)}; use the seed of this cell{more}"
 
 
 def _refused_request(subject: str) -> str:

@@ -8,9 +8,10 @@ access or by consumers, would let a user publish in the name of others.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from shmio.fabric.connection import inbox_prefix
+from shmio.fabric.connection import INBOX, OWN_INBOX, inbox_prefix
 from shmio.fabric.names import ROOT, CellName
 from shmio.fabric.registry import BUCKETS, CELLS, LAYOUTS
 
@@ -18,11 +19,20 @@ _ANY = f"{ROOT}.*.*.*"
 
 
 class Permissions(NamedTuple):
-    """The subjects to which a user may publish, but for some, and those that it may subscribe to."""
+    """The subjects to which a user may publish, and those that it may subscribe to, but for some of each."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
     publish_not: tuple[str, ...] = ()
+    subscribe_not: tuple[str, ...] = ()
+
+    def section(self) -> dict[str, dict[str, tuple[str, ...]]]:
+        """Return the section of the user in the configuration of a server."""
+        publish, subscribe = {"allow": self.publish}, {"allow": self.subscribe}
+        return {
+            "publish": publish | ({"deny": self.publish_not} if self.publish_not else {}),
+            "subscribe": subscribe | ({"deny": self.subscribe_not} if self.subscribe_not else {}),
+        }
 
 
 EVERYTHING = Permissions((">",), (">",))
@@ -41,7 +51,7 @@ def viewer_permissions(key: str) -> Permissions:
         key: The viewer's public NKey.
 
     """
-    return Permissions((*_REGISTRY, f"{_ANY}.*.missing"), _read(key))
+    return Permissions((*_REGISTRY, f"{_ANY}.*.missing"), _read(inbox_prefix(key)))
 
 
 def history_reader_permissions(key: str, streams: tuple[str, ...]) -> Permissions:
@@ -75,20 +85,48 @@ def cell_permissions(cell: CellName, key: str, stream: str) -> Permissions:
         stream: Name of the stream with the cell's history.
 
     """
-    publish = (
-        cell.live("*"),
-        cell.late("*"),
-        cell.status,
-        f"$KV.{CELLS}.{cell}",
-        f"$KV.{LAYOUTS}.*",
-        *_REGISTRY,
-        f"$JS.API.STREAM.INFO.{stream}",
-        f"{_ANY}.*.missing",
-        f"{_ANY}.*.command.{cell}",
-        "_INBOX.>",  # answers to requests; nobody can subscribe to another user's inbox
-    )
-    return Permissions(publish, (*_read(key), cell.missing("*"), f"{cell.subject}.*.command.*.*.*"))
+    publish = (*_own(cell), *_SHARED, f"$JS.API.STREAM.INFO.{stream}")
+    return Permissions(publish, (*_read(inbox_prefix(key)), *_asked(cell)))
 
 
-def _read(key: str) -> tuple[str, ...]:
-    return f"{_ANY}.*.live", f"{_ANY}.*.late", f"{_ANY}.status", f"{inbox_prefix(key)}.>"
+def others_permissions(own: CellName | None, cells: Sequence[CellName]) -> Permissions:
+    """Return what clients without credentials may do at the server that an instance runs.
+
+    They may do what a viewer may, and what the cells may that the instance allows.
+
+    Args:
+        own: The instance's cell; None if it has none. Nobody else publishes in its name.
+        cells: The allowed cells. A part of a name may be ``*``.
+
+    """
+    publish = [*_REGISTRY, f"{_ANY}.*.missing"]
+    subscribe = [*_read(INBOX)]
+    for cell in cells:
+        publish += [*_own(cell), *_SHARED, "$JS.API.STREAM.INFO.*"]
+        subscribe += _asked(cell)
+    refused = () if own is None else _own(own)
+    return Permissions(tuple(dict.fromkeys(publish)), tuple(dict.fromkeys(subscribe)), refused, (f"{OWN_INBOX}.>",))
+
+
+_SHARED = (
+    f"$KV.{LAYOUTS}.*",
+    *_REGISTRY,
+    f"{_ANY}.*.missing",
+    f"{INBOX}.>",  # answers to requests; nobody can subscribe to the inbox of a user with credentials
+)
+"""What each cell may publish to."""
+
+
+def _own(cell: CellName) -> tuple[str, ...]:
+    """Return the subjects to which only this cell may publish."""
+    name = str(cell)
+    return cell.live("*"), cell.late("*"), cell.status, f"$KV.{CELLS}.{name}", f"{_ANY}.*.command.{name}"
+
+
+def _asked(cell: CellName) -> tuple[str, ...]:
+    """Return the subjects on which others ask a cell."""
+    return cell.missing("*"), cell.command_subjects
+
+
+def _read(inbox: str) -> tuple[str, ...]:
+    return f"{_ANY}.*.live", f"{_ANY}.*.late", f"{_ANY}.status", f"{inbox}.>"

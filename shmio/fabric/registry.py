@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+from collections.abc import Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 import zstandard
@@ -32,9 +33,15 @@ BUCKETS: Final = (CELLS, LAYOUTS)
 RENEW_S: Final = 2.0
 DEAD_S: Final = 10.0
 MAX_LAYOUT_BYTES: Final = 64 << 20
+MAX_BUCKET_BYTES: Final = 256 << 20
+"""Maximum size of a bucket, so that cells cannot fill the disk of the servers."""
 MAX_REQUESTS: Final = 256
 """Maximum number of entries that are requested at the same time."""
 TIMEOUT_S: Final = 5.0
+ELECTION: Final = "if they are a cluster, they may be electing a leader, for which most of them must run"
+"""What may be the case if servers do not answer, although they refuse nothing."""
+_NO_LEADER: Final = (10008, 10009)
+"""Error codes of JetStream: it is not available for the moment, and a peer is not there."""
 _INSTALL: Final = "pip install 'shmio[fabric]'"
 
 
@@ -130,18 +137,37 @@ class Registry:
         self._layouts = layouts
 
     @classmethod
-    async def open(cls, client: Client, *, replicas: int = 1) -> Registry:
+    async def open(cls, client: Client) -> Registry:
         """Open the registry, and create its buckets if they are missing.
-
-        Args:
-            client: The connection.
-            replicas: Number of servers that store new buckets.
 
         Raises:
             RemoteError: The server has no JetStream, or refuses access.
 
         """
-        return cls(client, await _bucket(client, CELLS, replicas), await _bucket(client, LAYOUTS, replicas))
+        return cls(client, await _bucket(client, CELLS), await _bucket(client, LAYOUTS))
+
+    async def spread(self, replicas: int) -> None:
+        """Let at least this number of servers store the registry.
+
+        Raises:
+            RemoteError: The servers do not do so. The registry works as before.
+
+        """
+        errors, stream = library("nats.errors", _INSTALL), self._client.jetstream()
+        for bucket in BUCKETS:
+            try:
+                config = (await stream.stream_info(f"KV_{bucket}")).config
+                present = config.num_replicas or 1
+                if present < replicas:
+                    config.num_replicas = replicas
+                    await stream.update_stream(config)
+            except errors.Error as error:
+                why = "this user may not change it" if was_refused(self._client) else _description(error)
+                raise RemoteError(f"the registry is not kept by {replicas} servers: {why}") from None
+
+    async def missing_layouts(self, digests: Sequence[bytes]) -> list[bytes]:
+        """Return which of some layouts the registry does not have, by their hashes."""
+        return [digest for digest in digests if not (await self._keys(LAYOUTS, digest.hex()))[0]]
 
     async def claim(self, entry: CellEntry) -> int:
         """Claim the name of a cell; return the revision of its entry for :meth:`renew`.
@@ -216,12 +242,22 @@ class Registry:
 
         The library lists keys by a consumer. A user who may create consumers may let the server send
         what is stored to any subject, so the users of the fabric may not.
+
+        Raises:
+            nats.js.errors.Error: The server has no such bucket, or cannot tell at present.
+            RemoteError: The answer is not valid.
+
         """
         start = f"$KV.{bucket}."
         request = msgspec.json.encode({"subjects_filter": start + pattern})
         answer = await self._client.request(f"$JS.API.STREAM.INFO.KV_{bucket}", request, timeout=TIMEOUT_S)
-        info = msgspec.json.decode(answer.data, type=_StreamInfo)
-        now = datetime.fromisoformat(info.ts).timestamp()
+        try:
+            info = msgspec.json.decode(answer.data, type=_StreamInfo)
+            if info.error is not None:
+                raise library("nats.js.errors", _INSTALL).APIError.from_error(info.error)
+            now = datetime.fromisoformat(info.ts).timestamp()
+        except (ValueError, TypeError) as error:  # a MsgspecError is a ValueError
+            raise RemoteError(f"the server's answer about the bucket {bucket} is not valid: {error}") from None
         return sorted(subject.removeprefix(start) for subject in info.state.subjects or ()), now
 
     async def put_layout(self, layout: Layout) -> None:
@@ -281,11 +317,12 @@ def _unpack(packed: bytes) -> bytes:
 
 
 class _StreamInfo(msgspec.Struct):
-    ts: str
-    state: _StreamState
+    ts: str = ""
+    state: _StreamState = msgspec.field(default_factory=_StreamState)
+    error: dict[str, Any] | None = None
 
 
-async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
+async def _bucket(client: Client, name: str) -> KeyValue:
     errors = library("nats.js.errors", _INSTALL)
     nats_errors = library("nats.errors", _INSTALL)
     stream = client.jetstream()
@@ -293,18 +330,38 @@ async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
         try:
             return await stream.key_value(name)
         except errors.BucketNotFoundError:
-            await _create(client, name, replicas)
+            await _create(client, name)
             return await stream.key_value(name)
-    except (errors.ServiceUnavailableError, nats_errors.NoRespondersError):
-        raise RemoteError("the NATS server has no JetStream; start it with -js, or set jetstream in its file") from None
-    except (errors.APIError, nats_errors.TimeoutError) as error:
+    except (errors.APIError, nats_errors.TimeoutError, nats_errors.NoRespondersError) as error:
+        if is_away(error):
+            raise RemoteError(f"the NATS servers do not answer about the bucket {name}; {ELECTION}") from None
+        if isinstance(error, errors.ServiceUnavailableError | nats_errors.NoRespondersError):
+            raise RemoteError(
+                "the NATS server has no JetStream; start it with -js, or set jetstream in its file"
+            ) from None
+        if isinstance(error, nats_errors.TimeoutError) and not was_refused(client):
+            raise RemoteError(f"the NATS servers do not answer about the bucket {name}; {ELECTION}") from None
         raise RemoteError(
             f"the NATS server does not give access to its bucket {name}: {error}; if shmio fabric server-config made "
             "its configuration, run shmio fabric prepare once with the administrator's seed"
         ) from None
 
 
-async def _create(client: Client, name: str, replicas: int) -> None:
+def was_refused(client: Client) -> bool:
+    """Return whether the server has refused something to this client."""
+    return bool(getattr(client, "refused", ""))
+
+
+def _description(error: Exception) -> str:
+    return str(getattr(error, "description", None) or error or type(error).__name__)
+
+
+def is_away(error: Exception) -> bool:
+    """Return whether an error of JetStream means that the servers of a cluster have no leader at present."""
+    return getattr(error, "err_code", None) in _NO_LEADER
+
+
+async def _create(client: Client, name: str) -> None:
     """Create a bucket. A layout is stored once: nobody can replace it.
 
     Roll-ups are not allowed: by them, a cell that may write only its own key could remove all others.
@@ -318,6 +375,6 @@ async def _create(client: Client, name: str, replicas: int) -> None:
         max_msgs_per_subject=1,
         allow_rollup_hdrs=False,
         deny_delete=True,
-        num_replicas=replicas,
+        max_bytes=MAX_BUCKET_BYTES,
     )
     await client.jetstream().add_stream(config)

@@ -116,10 +116,7 @@ def server_configuration(settings: ServerSettings, index: int, users: Sequence[U
 
 
 def _entry(user: User, streams: tuple[str, ...]) -> dict[str, Any]:
-    allowed = _permissions(user, streams)
-    publish = {"allow": allowed.publish} | ({"deny": allowed.publish_not} if allowed.publish_not else {})
-    permissions = {"publish": publish, "subscribe": {"allow": allowed.subscribe}}
-    return {"nkey": user.key, "permissions": permissions}
+    return {"nkey": user.key, "permissions": _permissions(user, streams).section()}
 
 
 def _text(value: Any) -> str:

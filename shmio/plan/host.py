@@ -273,10 +273,14 @@ def _open_opcua(config: Config) -> Iterator[str]:
 
 
 def _open_fabric(config: Config) -> Iterator[str]:
-    """Yield a text that says what clients may do at the embedded NATS server."""
+    """Yield a text that says what clients without credentials may do at the embedded NATS server."""
     fabric = config.fabric
-    if fabric is not None and fabric.embedded and not (fabric.tls and fabric.tls.ca):
-        yield f"publish everything, values and commands too, by NATS at {fabric.listen}"
+    if fabric is None or not fabric.embedded or (fabric.tls and fabric.tls.ca) or not fabric.allow:
+        return
+    cells = _joined(sorted({pattern for one in fabric.allow for pattern in one.patterns}))
+    roles = sorted({role for one in fabric.allow for role in one.roles if role != "read"})
+    more = f" and {_joined(roles)} here" if roles else ""
+    yield f"publish as the cells {cells}{more} by NATS at {fabric.listen}"
 
 
 def _open_web(config: Config) -> Iterator[str]:

@@ -292,7 +292,7 @@ def make_plan(
         more = http | {"config_file": str(config_file.resolve())}
         more["recordings"] = recordings and str(recordings)
         more["scene"] = scene  # in place of its path
-        more["fabric"] = config.fabric and msgspec.to_builtins(Access.of(config.fabric))
+        more["fabric"] = config.fabric and msgspec.to_builtins(Access.of(config.fabric, process=True))
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
     if config.alert and mode == "live":
         sections.append((ALERTS, "alerts", _alerts(config, log_dir)))
@@ -345,7 +345,7 @@ def process_names(config: Config) -> list[str]:
 
 def mirror_settings(fabric: Fabric) -> dict[str, Any]:
     """Return what the process of a mirror needs to connect to the fabric, and the instance's name in it."""
-    return {"access": msgspec.to_builtins(Access.of(fabric)), "cell": fabric.cell}
+    return {"access": msgspec.to_builtins(Access.of(fabric, process=True)), "cell": fabric.cell}
 
 
 def _names(config: Config, mirror: Source) -> dict[str, str]:
@@ -402,12 +402,14 @@ def _fabric(config: Config, fabric: Fabric) -> list[tuple[str, str, dict[str, An
     """Return name, kind and section of the embedded server's process and of the uplink's, as far as they exist."""
     found: list[tuple[str, str, dict[str, Any]]] = []
     if fabric.embedded:
-        own = ("listen", "directory", "tls")
-        found.append((NATS, "fabric", {key: msgspec.to_builtins(getattr(fabric, key)) for key in own}))
+        own = ("listen", "directory", "tls", "cell", "store_mb")
+        server = {key: msgspec.to_builtins(getattr(fabric, key)) for key in own}
+        server["cells"] = sorted({pattern for one in fabric.allow for pattern in one.patterns})
+        found.append((NATS, "fabric", server))
     if fabric.cell is not None:
         keys = ("cell", "backlog_mb", "rule", "allow", "history")
         section = {key: msgspec.to_builtins(getattr(fabric, key)) for key in keys}
-        section["access"] = msgspec.to_builtins(Access.of(fabric))
+        section["access"] = msgspec.to_builtins(Access.of(fabric, process=True))
         if config.web is not None:
             scheme = "http" if config.web.certificate is None else "https"
             section["web"] = f"{scheme}://{config.web.listen}"

@@ -14,6 +14,7 @@ from shmio.endpoints.fabric.backlog import Row
 from shmio.fabric.connection import INSTALL
 from shmio.fabric.history_stream import create_history
 from shmio.fabric.names import CellName
+from shmio.fabric.registry import ELECTION, is_away, was_refused
 from shmio.libraries import library
 
 if TYPE_CHECKING:
@@ -78,13 +79,17 @@ class History:
         try:
             await create_history(client, self._cell, self._settings)
         except library("nats.errors", INSTALL).TimeoutError:
-            self._complain(
-                f"fabric.history: the servers do not let this cell create or change the stream {name}; run "
-                f"shmio fabric prepare --history {self._cell} as their administrator, with the same limits"
-            )
+            if was_refused(client):
+                self._complain(
+                    f"fabric.history: the servers do not let this cell create or change the stream {name}; run "
+                    f"shmio fabric prepare --history {self._cell} as their administrator, with the same limits"
+                )
+            else:
+                self._complain(f"fabric.history: the servers do not answer about the stream {name}; {ELECTION}")
             return False
         except errors.Error as error:
             why = getattr(error, "description", None) or str(error) or type(error).__name__
+            why = f"{why}; {ELECTION}" if is_away(error) else why
             self._complain(f"fabric.history: the servers do not create the stream {name}: {why}")
             return False
         self.problem = ""
@@ -101,13 +106,15 @@ class History:
         awaited = self._awaited.pop(int(message.subject.rpartition(".")[2]), None)
         if awaited is None:
             return
+        gone = False
         try:
             error = msgspec.json.decode(message.data, type=_Answer).error
             why = "" if error is None else str(error.get("description", error))
         except msgspec.MsgspecError:
-            why = "there is no stream"  # an empty answer with the status 503
+            why, gone = f"there is no stream; {ELECTION}", True  # an empty answer with the status 503
         if why:
             self._failed([awaited], why)
+            self._created = self._created and not gone  # the next check creates the stream if it is still missing
             return
         if (kept := awaited.row.find(awaited.number)) is not None:
             kept.confirmed = True

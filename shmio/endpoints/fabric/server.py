@@ -9,31 +9,42 @@ import re
 import shutil
 import socket
 import ssl
+import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from shmio.config import Address
+from shmio.config.fabric import STORE_MB
 from shmio.config.model import MqttTls
 from shmio.endpoints.server_process import CONNECT_S, Probe, ServerProcess
-from shmio.errors import ConfigError, EndpointError
+from shmio.errors import ConfigError, EndpointError, ShmioError
 from shmio.fabric.messages import MAX_MESSAGE_BYTES
+from shmio.fabric.names import CellName
+from shmio.fabric.own_seed import OwnSeed, nobodys_key
+from shmio.fabric.permissions import others_permissions
+from shmio.fabric.server_version import version_fault
 
 PROGRAM: Final = "nats-server"
 CONFIGURATION: Final = "nats-server.conf"
 LOCK: Final = "lock"
 STOP_S: Final = 5.0
+VERSION_S: Final = 5.0
 MAX_UNSENT_BYTES: Final = 64 << 20
 """Maximum size of what waits for a slow client, in bytes. Beyond it, the server disconnects the client."""
 MAX_MEMORY_BYTES: Final = 256 << 20
 """Maximum size of the streams that the server keeps in memory, in bytes. The fabric keeps all streams on the disk."""
+MAX_SUBSCRIPTIONS: Final = 10_000
+"""Maximum number of subscriptions of a connection."""
 PING: Final = b"PING\r\n"
 HELLO: Final = b'CONNECT {"verbose":false,"pedantic":false,"name":"shmio liveness"}\r\n' + PING
 MAX_GREETING_BYTES: Final = 1 << 16
 _STAMP: Final = re.compile(r"^\[\d+\] (?:\d{4}/\d\d/\d\d \d\d:\d\d:\d\d\.\d+ )?")
+_GLOB: Final = re.compile(r"[*?\[]")
+_CLIENT: Final = re.compile(r" - cid:\d+ - ")
 _LEVEL: Final = re.compile(r"^\[(INF|WRN|ERR|FTL|DBG|TRC)\](?: |$)")
 
 log = logging.getLogger("shmio.fabric")
@@ -46,12 +57,18 @@ class ServerSettings(msgspec.Struct, frozen=True):
         listen: Address at which clients connect.
         directory: Path of the directory with the server's files.
         tls: PEM files; None: without TLS.
+        store_mb: Maximum size in MB of the streams that the server keeps on the disk.
+        cell: Name of the instance's cell; None if it has none.
+        cells: Patterns for the names of other cells, for which clients without credentials may publish.
 
     """
 
     listen: str
     directory: str
     tls: MqttTls | None = None
+    store_mb: float = STORE_MB
+    cell: str | None = None
+    cells: Sequence[str] = ()
 
 
 def find_server() -> str | None:
@@ -74,26 +91,56 @@ def check_installed() -> None:
         )
 
 
-def configuration(settings: ServerSettings, name: str) -> bytes:
+def _version(program: str) -> str:
+    """Return what the server says about its version; empty if it does not."""
+    try:
+        done = subprocess.run([program, "--version"], capture_output=True, text=True, timeout=VERSION_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""  # its start will show what is wrong
+    return done.stdout
+
+
+def configuration(settings: ServerSettings, name: str, own: str, others: str) -> bytes:
     """Return the server's configuration file. The server also reads JSON.
 
+    All users are in the server's default account, which has the streams of earlier versions.
+
     Args:
-        settings: The address, the directory and the PEM files.
+        settings: The address, the directory, the limits and the PEM files.
         name: Name of the server, for its log and its monitoring.
+        own: Public NKey of the processes of the server's own user, who may do everything.
+        others: Public NKey that the server gives to clients without credentials.
 
     """
+    cell = None if settings.cell is None else CellName.parse(settings.cell)
+    permissions = others_permissions(cell, [_subjects(pattern) for pattern in settings.cells])
     listen = Address.parse(settings.listen)
     found: dict[str, Any] = {
         "host": listen.host,
         "port": listen.port,
         "server_name": name,
-        "jetstream": {"store_dir": settings.directory, "max_memory_store": MAX_MEMORY_BYTES},
+        "jetstream": {
+            "store_dir": settings.directory,
+            "max_memory_store": MAX_MEMORY_BYTES,
+            "max_file_store": round(settings.store_mb * 1e6),
+        },
+        "authorization": {"users": [{"nkey": own}, {"nkey": others, "permissions": permissions.section()}]},
+        "no_auth_user": others,
+        "max_subscriptions": MAX_SUBSCRIPTIONS,
         "max_payload": MAX_MESSAGE_BYTES,
         "max_pending": MAX_UNSENT_BYTES,
     }
     if settings.tls is not None:
         found["tls"] = _tls(settings.tls)
     return msgspec.json.format(msgspec.json.encode(found)) + b"\n"
+
+
+def _subjects(pattern: str) -> CellName:
+    """Return a pattern for names of cells as subjects can have it: a part with a wildcard becomes ``*``.
+
+    It may match more names. The owner of a cell checks the senders of commands by the pattern itself.
+    """
+    return CellName(*("*" if _GLOB.search(part) else part for part in pattern.split(".")))
 
 
 def _tls(tls: MqttTls) -> Mapping[str, Any]:
@@ -118,19 +165,27 @@ class NatsServer:
 
         Raises:
             ConfigError: The server is not installed.
-            EndpointError: The directory cannot be used.
+            EndpointError: The server is too old, or the directory cannot be used.
 
         """
         check_installed()
+        program = str(find_server())
+        if fault := version_fault(_version(program)):
+            raise EndpointError(f"{program}: {fault}")
         self._listen = Address.parse(settings.listen)
         self._tls = settings.tls
         self._lock = _prepare(Path(settings.directory))
+        try:
+            self._seed = OwnSeed(self._listen.here)
+        except ShmioError as error:
+            os.close(self._lock)
+            raise EndpointError(str(error)) from None
         file = Path(settings.directory) / CONFIGURATION
         try:
             fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
             with open(fd, "wb") as stream:  # noqa: PTH123  a descriptor
-                stream.write(configuration(settings, name))
-            command = [str(find_server()), "-c", str(file)]
+                stream.write(configuration(settings, name, self._seed.key, nobodys_key()))
+            command = [program, "-c", str(file)]
             self._process = ServerProcess("the NATS server", command, STOP_S, _read, Probe(self._connect, HELLO, PING))
         except OSError as error:
             os.close(self._lock)
@@ -168,10 +223,12 @@ class NatsServer:
     def check(self) -> None:
         """Check that the server is running and answers; raise EndpointError if it has ended or hangs."""
         self._process.check()
+        self._seed.keep()
 
     def stop(self) -> None:
         """Stop the server, and release its directory."""
         self._process.stop()
+        self._seed.remove()
         os.close(self._lock)
 
 
@@ -184,6 +241,8 @@ def _read(line: str) -> str:
     if kind == "INF":
         log.debug("nats-server: %s", text)
         return ""
+    if kind == "ERR" and _CLIENT.search(text):  # a client may not do what it asked for: the server works
+        kind = "WRN"
     log.log(logging.WARNING if kind == "WRN" else logging.ERROR, "nats-server: %s", text)
     return text if kind in ("ERR", "FTL") else ""
 

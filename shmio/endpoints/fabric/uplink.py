@@ -45,6 +45,8 @@ MIRROR: Final = "fabric"
 STOPPED: Final = str(State.STOPPED)
 RETRY_S: Final = 1.0
 """Pause in s before another attempt to claim the cell."""
+LAYOUTS_S: Final = 10.0
+"""Interval in s at which the uplink checks that the registry has its layouts."""
 LEAVE_S: Final = 2.0
 """Time limit in s for sending the last messages when the uplink stops."""
 MAX_REQUESTS: Final = 1024
@@ -109,6 +111,10 @@ class Uplink:
         )
         self._replies: set[asyncio.Task[None]] = set()
         self._errors = library("nats.errors", INSTALL)
+        stored = library("nats.js.errors", INSTALL)
+        self._gone = stored.NoStreamResponseError, stored.NotFoundError
+        self._checked_s = 0.0
+        self._unspread = ""
         self._generation = -1
         self._first = True
         self._relays: dict[int, Relay] = {}
@@ -276,7 +282,7 @@ class Uplink:
         while True:
             await self._connected.wait()
             if await self._establish(self._client):
-                await self._stay()
+                await self._stay(self._client)
             else:
                 await asyncio.sleep(RETRY_S)
 
@@ -301,8 +307,7 @@ class Uplink:
     async def _establish(self, client: FabricClient) -> bool:
         """Claim the cell, then publish. Return False if the registry does not answer."""
         try:
-            self._registry = await Registry.open(client)
-            await self._renew(self._registry)
+            await self._open_registry(client)
         except ConflictError as error:
             raise ConfigError(str(error)) from None
         except (RemoteError, self._errors.Error, TimeoutError) as error:
@@ -320,8 +325,17 @@ class Uplink:
             self.publisher.begin(client)
         return True
 
-    async def _stay(self) -> None:
+    async def _open_registry(self, client: FabricClient) -> None:
+        """Open the registry, and put the layouts and the cell's entry into it. If it is missing, create it."""
+        client.refused = ""
+        self._registry = await Registry.open(client)
+        self._known_layouts.clear()
+        self._checked_s = time.monotonic()
+        await self._renew(self._registry)
+
+    async def _stay(self, client: FabricClient) -> None:
         """Renew the cell's entry until the connection is lost."""
+        await self._spread_registry()
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(RENEW_S):
@@ -330,7 +344,12 @@ class Uplink:
             if not self.publisher.up:
                 return
             try:
-                await self._renew(self._registry)
+                try:
+                    await self._check_layouts()
+                    await self._renew(self._registry)
+                except self._gone:
+                    await self._open_registry(client)
+                    log.warning("the registry was gone; this cell is in a new one")
             except ConflictError as error:
                 raise ConfigError(str(error)) from None
             except (RemoteError, self._errors.Error, TimeoutError) as error:
@@ -341,6 +360,25 @@ class Uplink:
             if self._history is not None and self.publisher.up:
                 with suppress(self._errors.Error):
                     await self._history.check()
+
+    async def _spread_registry(self) -> None:
+        """Let as many servers keep the registry as keep the history."""
+        kept = self._settings.history
+        if kept is None or kept.replicas == 1 or not self._claimed:
+            return
+        try:
+            await self._registry.spread(kept.replicas)
+        except (RemoteError, TimeoutError) as error:
+            if str(error) != self._unspread:
+                remedy = f"run shmio fabric prepare --replicas {kept.replicas} with the administrator's seed"
+                log.warning("%s; %s", error, remedy)
+            self._unspread = str(error)
+
+    async def _check_layouts(self) -> None:
+        """Notice layouts that the registry has lost: the entry alone would not show it."""
+        if time.monotonic() - self._checked_s >= LAYOUTS_S:
+            self._checked_s = time.monotonic()
+            self._known_layouts.difference_update(await self._registry.missing_layouts(list(self._known_layouts)))
 
     def _complain(self, error: Exception) -> None:
         why = str(error)

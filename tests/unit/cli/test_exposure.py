@@ -29,6 +29,7 @@ GRPC = '[grpc]\nlisten = ["127.0.0.1:8089", "[::1]:8090"]\n'
 MQTT = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n'
 WEB = '[web]\nlisten = "127.0.0.1:8080"\n'
 FABRIC = '[fabric]\nserver = "embedded"\n'
+ALLOW = 'cell = "a.b.c"\n[[fabric.allow]]\nsender = "a.b.*"\nroles = ["read", "write", "inject"]\n'
 FREE = '[[mqtt.account]]\nroles = ["read", "write"]\n'
 
 
@@ -65,8 +66,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (MQTT + FREE, "[]", None),
         (MQTT, '["**"]', None),
         (MQTT + 'password_file = "accounts"\n', '["**"]', None),
-        (FABRIC, "[]", "by NATS at 127.0.0.1:4222 without logging in: for NATS, fabric.tls.ca or a server of"),
-        (FABRIC + WEB, "[]", "prevent this (see SECURITY.md); for NATS, fabric.tls.ca"),
+        (FABRIC, "[]", None),
+        (
+            FABRIC + ALLOW,
+            "[]",
+            "may publish as the cells a.b.* and inject and write here by NATS at 127.0.0.1:4222 without logging in",
+        ),
+        (FABRIC + ALLOW + WEB, "[]", "prevent this (see SECURITY.md); for NATS, fabric.tls.ca"),
         ("", '["**"]', None),
     ],
 )

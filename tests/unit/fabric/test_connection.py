@@ -102,6 +102,35 @@ def test_a_server_without_tls_gets_nothing_if_tls_is_required(scheme: str, tls: 
     assert set(received) == {b""}
 
 
+@pytest.mark.parametrize(("version", "works"), [("2.9.10", False), ("2.10.0-beta", True), ("3.0.0", True)])
+def test_a_server_that_is_too_old_is_refused(version: str, works: bool) -> None:
+    """Debian 12 has 2.9.10, whose answers have no time: a process that used it ended with a traceback."""
+
+    async def work() -> None:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(f'INFO {{"server_id": "x", "version": "{version}", "max_payload": 1000}}\r\n'.encode())
+            while line := await reader.readline():
+                if line.startswith(b"PING"):
+                    writer.write(b"PONG\r\n")
+            writer.close()
+            await writer.wait_closed()
+            ended.set()
+
+        ended = asyncio.Event()
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        access = Access((f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}",))
+        if works:
+            await (await connect(access, "test", patient=False)).leave()
+        else:
+            with pytest.raises(RemoteError, match=r"NATS 2\.9\.10, but the fabric needs 2\.10 or later; upgrade"):
+                await connect(access, "test", patient=False)
+        await asyncio.wait_for(ended.wait(), TIMEOUT_S)
+        server.close()
+        await server.wait_closed()
+
+    asyncio.run(work())
+
+
 @pytest.mark.parametrize("connects", [True, False])
 def test_waiting_for_a_server_can_be_stopped_although_a_cancellation_is_lost(
     connects: bool, monkeypatch: pytest.MonkeyPatch

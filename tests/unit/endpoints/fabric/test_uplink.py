@@ -7,12 +7,14 @@ import json
 import os
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import nats
 import pytest
 from nats.aio.msg import Msg
+from nats.js.errors import Error as JetStreamError
 
-from shmio.config.model import FabricRule
+from shmio.config.model import FabricHistory, FabricRule
 from shmio.endpoints.fabric import uplink as uplink_module
 from shmio.endpoints.fabric.uplink import Uplink
 from shmio.errors import ConfigError
@@ -20,7 +22,7 @@ from shmio.fabric.connection import Access, connect
 from shmio.fabric.registry import Registry
 from shmio.fabric.tasks import end
 from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment, State
-from tests.nats_server import NatsServer, link
+from tests.nats_server import NatsServer, link, nats_server
 from tests.unit.endpoints.fabric.harness import (
     CELL,
     LAYOUT,
@@ -79,6 +81,47 @@ async def test_the_registry_knows_the_cell(segment: Segment, server: NatsServer)
     assert seen is not None
     assert seen.entry.state == "stopped"
     await client.close()
+
+
+@in_loop
+async def test_a_deleted_registry_comes_again(
+    segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uplink_module, "RENEW_S", 0.02)
+    monkeypatch.setattr(uplink_module, "LAYOUTS_S", 0.0)
+    async with uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        client = await connect(Access((server.url,)), "test")
+        stream = client.jetstream()
+
+        async def complete() -> None:
+            whole = [("KV_shmio_cells", 1), ("KV_shmio_layouts", 1)]
+            streams: list[tuple[str | None, int]] = []
+            async with asyncio.timeout(TIMEOUT_S):
+                while streams != whole or found.problem:
+                    with suppress(JetStreamError):
+                        infos = await stream.streams_info()
+                        streams = sorted((one.config.name, one.state.messages) for one in infos)
+
+        for gone in (["shmio_cells", "shmio_layouts"], ["shmio_layouts"], ["shmio_cells"]):
+            for bucket in gone:
+                await stream.delete_stream(f"KV_{bucket}")
+            await complete()
+        await stream.purge_stream("KV_shmio_layouts")
+        await stream.purge_stream("KV_shmio_cells")
+        await complete()
+        assert found.publisher.up
+        await client.close()
+
+
+@in_loop
+async def test_servers_without_a_leader_refuse_nothing(segment: Segment, tmp_path: Path) -> None:
+    """One of three servers of a cluster runs."""
+    cluster = {"name": "x", "listen": "127.0.0.1:-1", "routes": ["nats://127.0.0.1:1", "nats://127.0.0.1:2"]}
+    with nats_server(tmp_path / "nats", cluster=cluster, server_name="a") as server:
+        async with uplink(segment, server.url, history=FabricHistory(replicas=3)) as found:
+            await until(lambda: "electing a leader" in found.problem)
+            assert not any(word in found.problem for word in ("prepare", "JetStream;", "access"))
 
 
 @in_loop
