@@ -390,7 +390,8 @@ def _why(access: Access, error: BaseException) -> str:
 
 def _unreachable(access: Access, error: BaseException) -> str:
     if not isinstance(error, ssl.SSLCertVerificationError):
-        return f"no NATS server can be reached: {reason(error)}"
+        why = reason(error)
+        return why if why.startswith("the server is ") else f"no NATS server can be reached: {why}"
     if access.pinned is not None:
         return f"the server's certificate is not {access.pinned}; another program listens there"
     if error.verify_code in _UNTRUSTED:

@@ -42,6 +42,8 @@ ELECTION: Final = "if they are a cluster, they may be electing a leader, for whi
 """What may be the case if servers do not answer, although they refuse nothing."""
 _NO_LEADER: Final = (10008, 10009)
 """Error codes of JetStream: it is not available for the moment, and a peer is not there."""
+_NO_CLUSTER: Final = 10074
+"""Error code of JetStream: a single server keeps no replicas."""
 _INSTALL: Final = "pip install 'shmio[fabric]'"
 
 
@@ -137,14 +139,18 @@ class Registry:
         self._layouts = layouts
 
     @classmethod
-    async def open(cls, client: Client) -> Registry:
+    async def open(cls, client: Client, *, replicas: int = 1) -> Registry:
         """Open the registry, and create its buckets if they are missing.
+
+        Args:
+            client: The connection.
+            replicas: Number of servers that store new buckets; a single server stores them alone.
 
         Raises:
             RemoteError: The server has no JetStream, or refuses access.
 
         """
-        return cls(client, await _bucket(client, CELLS), await _bucket(client, LAYOUTS))
+        return cls(client, await _bucket(client, CELLS, replicas), await _bucket(client, LAYOUTS, replicas))
 
     async def spread(self, replicas: int) -> None:
         """Let at least this number of servers store the registry.
@@ -322,7 +328,7 @@ class _StreamInfo(msgspec.Struct):
     error: dict[str, Any] | None = None
 
 
-async def _bucket(client: Client, name: str) -> KeyValue:
+async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
     errors = library("nats.js.errors", _INSTALL)
     nats_errors = library("nats.errors", _INSTALL)
     stream = client.jetstream()
@@ -330,7 +336,7 @@ async def _bucket(client: Client, name: str) -> KeyValue:
         try:
             return await stream.key_value(name)
         except errors.BucketNotFoundError:
-            await _create(client, name)
+            await _create(client, name, replicas)
             return await stream.key_value(name)
     except (errors.APIError, nats_errors.TimeoutError, nats_errors.NoRespondersError) as error:
         if is_away(error):
@@ -361,7 +367,7 @@ def is_away(error: Exception) -> bool:
     return getattr(error, "err_code", None) in _NO_LEADER
 
 
-async def _create(client: Client, name: str) -> None:
+async def _create(client: Client, name: str, replicas: int) -> None:
     """Create a bucket. A layout is stored once: nobody can replace it.
 
     Roll-ups are not allowed: by them, a cell that may write only its own key could remove all others.
@@ -375,6 +381,13 @@ async def _create(client: Client, name: str) -> None:
         max_msgs_per_subject=1,
         allow_rollup_hdrs=False,
         deny_delete=True,
+        num_replicas=replicas,
         max_bytes=MAX_BUCKET_BYTES,
     )
-    await client.jetstream().add_stream(config)
+    try:
+        await client.jetstream().add_stream(config)
+    except library("nats.js.errors", _INSTALL).APIError as error:
+        if replicas == 1 or error.err_code != _NO_CLUSTER:
+            raise
+        config.num_replicas = 1
+        await client.jetstream().add_stream(config)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import shutil
 import signal
 import subprocess
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
 from shmio.lab import Laboratory, prepare_laboratory
+from shmio.lab.fmu.secrets import MARK
 from shmio.testing.cell import BIN, until
 from tests.fmus import build
 
@@ -205,6 +208,92 @@ period_ms = 20
     assert levels[0] == levels[1]
     assert levels[0][1] != 0
     assert all(isinstance(value, float) and math.isfinite(value) for value in levels[0])
+
+
+SECRET = "secret-0123456789abcdef"
+ENDPOINTS = f"""
+# the old password = {SECRET}
+[grpc]
+listen = ["127.0.0.1:1"]
+[[grpc.token]]
+name = "a"
+roles = ["read"]
+token_file = "token.csv"
+[[grpc.token]]
+name = "b"
+roles = ["read"]
+sha256 = "{hashlib.sha256(SECRET.encode()).hexdigest()}"
+[[alert]]
+name = "bad"
+bad = ["belt"]
+webhook = "http://127.0.0.1/{SECRET}"
+webhook_header_file = "headers.ini"
+"""
+OTHER = f"""
+[instance]
+name = "other"
+[[source]]
+name = "plc"
+connector = "mtconnect"
+password = "{SECRET}"
+user_key = "own.json"
+"""
+KEYED = """
+from shmio.simulation import Model, Output, Parameter
+
+class Keyed(Model):
+    api_key = Parameter("STRING[40]", "")
+    pin = Parameter("INT", 0)
+    length = Output("INT")
+
+    def step(self, time_s, dt_s):
+        self.length = len(self.api_key) + self.pin
+"""
+
+
+def test_secrets_are_left_out_and_asked_for(tmp_path: Path) -> None:
+    """Whoever gets the FMU can read its files."""
+    source = '[[source]]\nname = "s"\nconnector = "simulation"\nmodel = "keyed:Keyed"\nperiod_ms = 20\n'
+    source += f'parameters = {{ api_key = "{SECRET}", pin = 7 }}\n'
+    files = {
+        "token.csv": SECRET,
+        "headers.ini": f"Authorization: Bearer {SECRET}",
+        "other/own.json": SECRET,
+        "other/supervisor.toml": OTHER,
+    }
+    (tmp_path / "other").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).touch(0o600)
+        (tmp_path / name).write_text(text)
+    (tmp_path / "keyed.py").write_text(KEYED)
+    (tmp_path / "other" / "tags.toml").write_text('[registers]\npassword = "INT"\n')
+    (tmp_path / "supervisor.toml").write_text('[instance]\nname = "keyed"\n' + source + ENDPOINTS)
+    command = [BIN / "shmio-supervisor", "export-fmu", "-o", "cell.fmu"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines() == [
+        "left out, because they may have secrets: headers.ini, token.csv, other/own.json, other/supervisor.toml",
+        "left out, because their values may be secret, and the FMU asks for them: source[0].parameters.api_key",
+    ]
+    with zipfile.ZipFile(tmp_path / "cell.fmu") as fmu:
+        found = {name: fmu.read(name) for name in fmu.namelist()}
+    assert {name.removeprefix("resources/cell/") for name in found if name.startswith("resources/cell/")} == {
+        "keyed.py",
+        "other/tags.toml",
+        "supervisor.toml",
+    }
+    hidden = SECRET.encode(), hashlib.sha256(SECRET.encode()).hexdigest().encode()
+    assert [name for name, data in found.items() if any(one in data for one in hidden)] == []
+    made = Instances(tmp_path / "cell.fmu", tmp_path)
+    with pytest.raises(Exception, match="instantiate"):
+        made.make()
+    assert "source[0].parameters.api_key: the export has left this secret out; write it into" in made.messages[-1]
+    file = Path(made._folder) / "resources" / "cell" / "supervisor.toml"
+    file.write_text(file.read_text().replace(MARK, "12345"))
+    fmu = made.make()
+    fmu.doStep(0.0, STEP_S)
+    assert fmu.getInteger([made.references["s/length"]]) == [5 + 7]
+    fmu.terminate()
+    fmu.freeInstance()
 
 
 def test_what_cannot_be_exported_is_named(export: Callable[..., Path], tmp_path: Path) -> None:

@@ -31,9 +31,10 @@ from shmio.endpoints.fabric.server import find_server
 from shmio.errors import ConflictError, RemoteError
 from shmio.fabric.archive.folder import ArchiveFolder
 from shmio.fabric.archive.service import Archive, ArchiveLimits
+from shmio.fabric.client import FabricClient
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.names import CellName
-from shmio.fabric.registry import CELLS, CellEntry, Registry
+from shmio.fabric.registry import BUCKETS, CELLS, CellEntry, Registry
 from shmio.fabric.server_config import FARM_LIMITS
 from shmio.falsification.farm.exchange import NAME, contact, open_consumer, open_store, tasks_of
 from shmio.layout.model import Layout, Register
@@ -577,12 +578,28 @@ def _run_cluster(folder: Path, ports: list[int], capsys: pytest.CaptureFixture[s
         end = asyncio.run(_until(lambda: main([*prepare, "--server", servers[0].url]) == 0))
         assert end, capsys.readouterr().err
 
+        async def spread(cell: FabricClient) -> None:
+            """An older registry, which one server keeps, follows a cell whose history more servers keep."""
+            admin = await connect(Access((servers[0].url,), credentials=str(folder / "admin.seed")), "a", patient=False)
+            stream = admin.jetstream()
+            for bucket in BUCKETS:
+                config = (await stream.stream_info(f"KV_{bucket}")).config
+                assert config.num_replicas == 3
+                config.num_replicas = 1
+                await stream.update_stream(config)
+            with pytest.raises(RemoteError, match="this user may not change it"):
+                await (await Registry.open(cell)).spread(3)
+            await (await Registry.open(admin)).spread(3)
+            assert {(await stream.stream_info(f"KV_{bucket}")).config.num_replicas for bucket in BUCKETS} == {3}
+            await admin.close()
+
         async def check() -> None:
             seed = str(folder / f"cells/{A}.seed")
             near = await connect(Access((servers[0].url,), credentials=seed), "near", patient=False)
             far = await connect(Access((servers[2].url,), credentials=seed), "far", patient=False)
             await (await Registry.open(near)).claim(entry(A))
             assert await (await Registry.open(far)).find(A) is not None
+            await spread(far)
             await near.close()
             await far.close()
             seed = str(folder / "farm-users/lab.seed")

@@ -35,7 +35,7 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError(f"the limits of a history: {error}") from None
 
     async def work(client: Client) -> None:
-        await (await Registry.open(client)).spread(options.replicas)
+        await (await Registry.open(client, replicas=options.replicas)).spread(options.replicas)
         for cell in cells:
             try:
                 await create_history(client, cell, settings)

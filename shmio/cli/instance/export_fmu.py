@@ -25,9 +25,14 @@ def export_fmu(arguments: argparse.Namespace) -> int:
     """
     file: Path = arguments.output
     done = export(config_file(arguments), file, arguments.only)
-    if done.left_out:
-        more = len(done.left_out) - SHOWN
-        shown = ", ".join(done.left_out[:SHOWN]) + (f" and {more} more" if more > 0 else "")
-        say(f"left out, because FMI 2.0 has no such types: {shown}", sys.stderr)
+    for names, why in (
+        (done.left_out, "FMI 2.0 has no such types"),
+        (done.secret_files, "they may have secrets"),
+        (done.secret_keys, "their values may be secret, and the FMU asks for them"),
+    ):
+        if names:
+            more = len(names) - SHOWN
+            shown = ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+            say(f"left out, because {why}: {shown}", sys.stderr)
     print(printable(f"wrote {file}: {done.inputs} inputs, {done.outputs} outputs"))
     return 0

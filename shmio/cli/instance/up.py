@@ -162,7 +162,7 @@ def _describe(job: Job, prepared: Prepared) -> str:
     if job.kind == "mqtt":
         return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
     if job.kind == "fabric":
-        return f"cell {config['cell']} at {', '.join(config['access']['servers'])}" if "cell" in config else _at(job)
+        return f"cell {config['cell']} at {', '.join(config['access']['servers'])}" if "access" in config else _at(job)
     if job.kind == "web":
         scheme = "https" if config["certificate"] else "http"
         return f"{scheme}://{config['listen']}/{'' if job.name == 'web' else 'metrics'}"

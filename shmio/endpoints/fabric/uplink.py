@@ -328,7 +328,8 @@ class Uplink:
     async def _open_registry(self, client: FabricClient) -> None:
         """Open the registry, and put the layouts and the cell's entry into it. If it is missing, create it."""
         client.refused = ""
-        self._registry = await Registry.open(client)
+        kept = self._settings.history
+        self._registry = await Registry.open(client, replicas=1 if kept is None else kept.replicas)
         self._known_layouts.clear()
         self._checked_s = time.monotonic()
         await self._renew(self._registry)

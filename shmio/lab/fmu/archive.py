@@ -19,9 +19,11 @@ from xml.sax.saxutils import quoteattr as _quoteattr
 
 import msgspec
 
+from shmio.config.toml import toml_file
 from shmio.errors import ConfigError, LayoutError
 from shmio.lab.fmu.exchange import Group, Values, groups_of
 from shmio.lab.fmu.process import CONFIG, MANIFEST, Manifest, image_of
+from shmio.lab.fmu.secrets import kept, read_instance, secret_files, without_secrets
 from shmio.lab.laboratory import Laboratory, prepare_laboratory
 from shmio.version import __version__
 
@@ -42,11 +44,22 @@ def quoteattr(text: str) -> str:
 
 
 class Exported(NamedTuple):
-    """The result of an export: the numbers of inputs and outputs, and the registers that were left out."""
+    """The result of an export: the numbers of inputs and outputs, and what was left out.
+
+    Attributes:
+        inputs: Number of inputs.
+        outputs: Number of outputs.
+        left_out: Registers whose types FMI does not have.
+        secret_keys: Keys of the configuration whose values may be secret.
+        secret_files: Files that may have secrets, and other configurations.
+
+    """
 
     inputs: int
     outputs: int
     left_out: list[str]
+    secret_keys: list[str]
+    secret_files: list[str]
 
 
 def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
@@ -68,7 +81,10 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
         raise ConfigError(f"FMI 2.0 has no name for Linux on {platform.machine()}; export on x86_64")
     with tempfile.TemporaryDirectory(prefix="shmio-export-") as folder:
         work = Path(folder)
-        _copy(config.resolve().parent, work / CONFIG)
+        tables = read_instance(config) or {}
+        secret = _copy(config.resolve(), tables, work / CONFIG)
+        if tables:
+            (work / CONFIG / config.name).write_text(toml_file(kept(tables)), encoding="utf-8")
         try:
             plan = prepare_laboratory(work / CONFIG / config.name)
         except (ConfigError, LayoutError) as error:
@@ -86,38 +102,57 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
         guid = "{" + hashlib.sha256("\n".join([*names, *(one.kind for one in groups)]).encode()).hexdigest()[:32] + "}"
         step_s = min(block.period_ns for block in plan.blocks) / 1e9
         description = "\n".join(_description(plan.instance, guid, groups, start, step_s)) + "\n"
+        text, keys = without_secrets(kept(tables))
+        (work / CONFIG / config.name).write_text(text, encoding="utf-8")
         manifest = Manifest(config.name, list(patterns), names)
         library = _compile(work, guid)
         _write(file, description, library, machine, manifest, work / CONFIG)
     inputs = sum(len(one.names) for one in groups if one.is_input)
-    return Exported(inputs, len(names) - inputs, left_out)
+    return Exported(inputs, len(names) - inputs, left_out, keys, secret)
 
 
-def _copy(source: Path, target: Path) -> None:
-    """Copy the files that an instance may need.
+def _copy(config: Path, tables: dict[str, Any], target: Path) -> list[str]:
+    """Copy the files that an instance may need, but for those with secrets, which are returned.
 
     Raises:
         ConfigError: The files are too large, or cannot be read.
 
     """
-    size = 0
+    source, size, secret = config.parent, 0, list[str]()
+    others = {file.resolve(): found for file in _files(source) if (found := _other_instance(file, config)) is not None}
+    hidden = secret_files(tables, source).union(
+        others, *(secret_files(found, file.parent) for file, found in others.items())
+    )
     try:
-        for folder, folders, files in os.walk(source):
-            folders[:] = sorted(one for one in folders if one not in _SKIPPED and not one.startswith("."))
-            for name in sorted(files):
-                file = Path(folder) / name
-                if file.suffix not in SUFFIXES or name.startswith(".") or not file.is_file():
-                    continue
-                size += file.stat().st_size
-                if size > MAX_BYTES:
-                    raise ConfigError(
-                        f"the files of {source} have more than {MAX_BYTES >> 20} MB; give the instance its own folder"
-                    )
-                copy = target / file.relative_to(source)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, copy)
+        for file in _files(source):
+            if file.resolve() in hidden:
+                secret.append(str(file.relative_to(source)))
+                continue
+            size += file.stat().st_size
+            if size > MAX_BYTES:
+                raise ConfigError(
+                    f"the files of {source} have more than {MAX_BYTES >> 20} MB; give the instance its own folder"
+                )
+            copy = target / file.relative_to(source)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
     except OSError as error:
         raise ConfigError(f"{error.filename}: {error.strerror}") from None
+    return secret
+
+
+def _other_instance(file: Path, config: Path) -> dict[str, Any] | None:
+    return read_instance(file) if file.suffix == ".toml" and file.resolve() != config else None
+
+
+def _files(source: Path) -> Iterator[Path]:
+    """Yield the files below a folder that an instance may need."""
+    for folder, folders, files in os.walk(source):
+        folders[:] = sorted(one for one in folders if one not in _SKIPPED and not one.startswith("."))
+        for name in sorted(files):
+            file = Path(folder) / name
+            if file.suffix in SUFFIXES and not name.startswith(".") and file.is_file():
+                yield file
 
 
 def _compile(work: Path, guid: str) -> Path:

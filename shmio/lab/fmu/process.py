@@ -18,6 +18,7 @@ import msgspec
 
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.lab.fmu.exchange import KINDS, Values, groups_of
+from shmio.lab.fmu.secrets import check_complete
 from shmio.lab.laboratory import Laboratory, prepare_laboratory
 from shmio.local.attach import Attachment
 
@@ -108,6 +109,7 @@ def main() -> int:
     with link, ExitStack() as stack:
         try:
             manifest = msgspec.json.decode((resources / MANIFEST).read_bytes(), type=Manifest)
+            check_complete(resources / CONFIG / manifest.config)
             lab = stack.enter_context(Laboratory(prepare_laboratory(resources / CONFIG / manifest.config)))
             session = Session(lab, stack.enter_context(lab.attach()), manifest)
         except (ShmioError, OSError, msgspec.MsgspecError) as error:
