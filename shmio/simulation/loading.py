@@ -12,6 +12,7 @@ from typing import Any, Final, TypeGuard
 
 from shmio.errors import ConfigError
 from shmio.simulation import fmu
+from shmio.simulation.fmu import DEFAULTS, FmuOptions
 from shmio.simulation.model import Model, explain
 from shmio.wording import unknown
 
@@ -23,7 +24,7 @@ _FOLDERS: Final[set[Path]] = set()
 """The folders from which models were loaded."""
 
 
-def load(text: str, folder: str | Path | None = None, *, strict: bool = False) -> type[Model]:
+def load(text: str, folder: str | Path | None = None, options: FmuOptions = DEFAULTS) -> type[Model]:
     """Import a model's class, or make one of an FMU.
 
     Args:
@@ -31,7 +32,7 @@ def load(text: str, folder: str | Path | None = None, *, strict: bool = False) -
         folder: A folder to search for FMUs and modules first, such as the configuration's folder;
             None: no folder. A file in it precedes an installed module of the same name, also one of
             Python itself, but not shmio.
-        strict: True to refuse an FMU with any formal defect.
+        options: How to read an FMU.
 
     Raises:
         ConfigError: The text is malformed, the module or class does not exist, its import fails, or
@@ -40,9 +41,9 @@ def load(text: str, folder: str | Path | None = None, *, strict: bool = False) -
 
     """
     if fmu.is_fmu(text):
-        return fmu.load_fmu(Path(folder or ".") / text, strict=strict)
-    if strict:
-        raise ConfigError("strict = true is only for FMUs; leave it out")
+        return fmu.load_fmu(Path(folder or ".") / text, options)
+    if options != DEFAULTS:
+        raise ConfigError("strict and text_length are only for FMUs; leave them out")
     name, colon, attribute = text.partition(":")
     if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in name.split("."))):
         raise ConfigError(f"expected package.module:Class or the file of an FMU (.fmu), found {text!r}")

@@ -20,6 +20,7 @@ from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
+from shmio.simulation.fmu import DEFAULTS, FmuOptions
 from shmio.simulation.loading import load
 from shmio.simulation.model import layout_of
 from shmio.simulation.runner import ModelRunner
@@ -32,7 +33,8 @@ class Simulation(Computed):
         """Keys of the source.
 
         ``model`` is ``package.module:Class``, or the file of an FMU. Modules that are not installed
-        and FMUs are searched for in ``folder``. ``strict`` refuses an FMU with any formal defect.
+        and FMUs are searched for in ``folder``. ``strict`` and ``text_length`` are for FMUs: see
+        :class:`~shmio.simulation.fmu.FmuOptions`.
         """
 
         model: str
@@ -41,6 +43,7 @@ class Simulation(Computed):
         connections: dict[str, str] = {}
         folder: str = "."
         strict: bool = False
+        text_length: Annotated[int, msgspec.Meta(ge=1, le=16_382)] = DEFAULTS.text_length
 
     def __init__(self, options: Options, layout: Layout) -> None:
         """Create the model.
@@ -109,7 +112,7 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
 
     """
     try:
-        model = load(options.model, options.folder, strict=options.strict)
+        model = load(options.model, options.folder, FmuOptions(options.strict, options.text_length))
         model, parameters = model.with_parameters(options.parameters)
         own = layout_of(model) if layout is None else layout
     except (ConfigError, ModelError) as error:

@@ -5,6 +5,7 @@
 :meth:`FmuModel.start` does.
 """
 
+from shmio.simulation.fmu.description import DEFAULTS, FmuOptions
 from shmio.simulation.fmu.model import FmuModel, is_fmu, load_fmu
 
-__all__ = ["FmuModel", "is_fmu", "load_fmu"]
+__all__ = ["DEFAULTS", "FmuModel", "FmuOptions", "is_fmu", "load_fmu"]

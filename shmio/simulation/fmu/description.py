@@ -21,9 +21,8 @@ from shmio.wording import printable
 STRUCTURAL: Final = "structuralParameter"
 NO_STRUCTURE: Final[Mapping[str, int]] = MappingProxyType({})
 EXTRA: Final = "an FMU needs another library; run pip install 'shmio[fmu]'"
-MAX_STRING: Final = 254
-"""Length of the register of a text whose start value is not longer."""
-MAX_LONG_STRING: Final = 16_382
+TEXT_LENGTH: Final = 254
+MAX_TEXT_LENGTH: Final = 16_382
 MAX_ELEMENTS: Final = 1 << 20
 TYPES: Final = {
     "Real": "LREAL",
@@ -39,7 +38,7 @@ TYPES: Final = {
     "Int64": "LINT",
     "UInt64": "ULINT",
     "Boolean": "BOOL",
-    "String": f"WSTRING[{MAX_STRING}]",
+    "String": f"WSTRING[{TEXT_LENGTH}]",
 }
 """The register's type for each type of variable. Variables of other types are left out."""
 _KINDS: Final[dict[str, type[Input] | type[Output] | type[Parameter]]] = {
@@ -60,6 +59,20 @@ _OF_VALUES: Final = frozenset(
     {*TYPES, "Binary", "Clock", "Enumeration", "ScalarVariable", "Dimension", "Start", "Item", "DefaultExperiment"}
 )
 """The elements that contain values of variables, or say what the values are."""
+
+
+class FmuOptions(NamedTuple):
+    """How to read an FMU.
+
+    ``strict`` refuses a description with any formal defect. ``text_length`` is the number of characters, in UTF-16, of
+    the registers of texts whose start values are not longer.
+    """
+
+    strict: bool = False
+    text_length: int = TEXT_LENGTH
+
+
+DEFAULTS: Final = FmuOptions()
 
 
 class Variable(NamedTuple):
@@ -104,19 +117,21 @@ class Description(NamedTuple):
     """What the user should know."""
 
 
-def describe(archive: Archive, *, strict: bool, structure: Mapping[str, int] = NO_STRUCTURE) -> Description:
+def describe(
+    archive: Archive, options: FmuOptions = DEFAULTS, structure: Mapping[str, int] = NO_STRUCTURE
+) -> Description:
     """Read the description of an FMU, without running any of its code.
 
     Args:
         archive: The FMU.
-        strict: True to refuse a description with any formal defect.
+        options: How to read it.
         structure: Values of structural parameters, which determine the sizes of arrays, by name.
 
     Raises:
         ModelError: The description is invalid, or shmio cannot run this FMU on this machine.
 
     """
-    parsed, root, defect = _parse(archive.description, strict=strict)
+    parsed, root, defect = _parse(archive.description, strict=options.strict)
     cosimulation = parsed.coSimulation
     if cosimulation is None:
         raise ModelError("it is not for co-simulation; export it for co-simulation (FMI 2.0 or 3.0)")
@@ -127,7 +142,7 @@ def describe(archive: Archive, *, strict: bool, structure: Mapping[str, int] = N
     _check_platform(archive.names, version, identifier)
     experiment = parsed.defaultExperiment
     elements = {one.get("name", ""): one for one in root.iterfind("ModelVariables/*")}
-    found = dict(_variables(parsed, version, elements, structure))
+    found = dict(_variables(parsed, version, elements, options.text_length, structure))
     return Description(
         parsed,
         version,
@@ -265,7 +280,7 @@ def _left_out(parsed: Any) -> str:
 
 
 def _variables(
-    parsed: Any, version: int, elements: Mapping[str, Any], structure: Mapping[str, int]
+    parsed: Any, version: int, elements: Mapping[str, Any], text_length: int, structure: Mapping[str, int]
 ) -> Iterator[tuple[Variable, Declaration]]:
     """Yield the inputs, outputs and parameters, with their declarations.
 
@@ -301,7 +316,7 @@ def _variables(
             unit = printable(_inherited(variable, "unit") or "")[:_MAX_UNIT]
             if not 0 <= variable.valueReference <= _MAX_REFERENCE:
                 raise ValueError(f"its valueReference {variable.valueReference} is no 32-bit number")
-            base = _text_type(initial) if type_ == "String" else TYPES[type_]
+            base = _text_type(initial, text_length) if type_ == "String" else TYPES[type_]
             array = f"ARRAY[{bounds}] OF {base}" if shape else base
             declaration = kind(array, initial, unit=unit, comment=comment, limits=limits)
             declaration.any_text = type_ == "String"
@@ -337,11 +352,11 @@ def _texts(variable: Any, element: Any, version: int) -> list[str] | None:
     return [one.get("value", "") for one in element.findall("Start")] or None
 
 
-def _text_type(initial: object) -> str:
-    """Return the type of a register for a text: it holds the start values, and 254 characters."""
+def _text_type(initial: object, least: int) -> str:
+    """Return the type of a register for a text: it holds the start values, and at least ``least`` characters."""
     texts = initial if isinstance(initial, list) else [initial]
     units = max(len(text.encode("utf-16-le", "surrogatepass")) // 2 for text in (str(one or "") for one in texts))
-    return f"WSTRING[{min(max(units, MAX_STRING), MAX_LONG_STRING)}]"
+    return f"WSTRING[{min(max(units, least), MAX_TEXT_LENGTH)}]"
 
 
 def start_value(text: str, variable: Variable) -> object:

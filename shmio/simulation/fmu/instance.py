@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from shmio.errors import ModelError
+from shmio.errors import ModelError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.logs import LogRateLimit
 from shmio.simulation.fmu.description import Description, Variable
@@ -403,7 +403,12 @@ class Group:
             for view, one in zip(self._views, data, strict=True):
                 view[:] = one
             return
-        self._show([self._text(text or b"") for text in self._texts])
+        shown = [self._text(text or b"") for text in self._texts]
+        try:
+            self._show(shown)
+        except ValueRangeError as error:
+            longest = max(len(text.encode("utf-16-le")) // 2 for text in shown)
+            raise ValueRangeError(f"{error}; the source needs text_length = {longest}") from None
         self._shown = self._texts, [bytes(view) for view in self._views]
 
     def _text(self, data: bytes) -> str:

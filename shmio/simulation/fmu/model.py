@@ -13,7 +13,16 @@ import msgspec
 from shmio.errors import ModelError, ShmioError, SnapshotError
 from shmio.layout.values.codec import nest
 from shmio.simulation.fmu.archive import Archive, Extracted
-from shmio.simulation.fmu.description import NO_STRUCTURE, STRUCTURAL, Description, Variable, describe, start_value
+from shmio.simulation.fmu.description import (
+    DEFAULTS,
+    NO_STRUCTURE,
+    STRUCTURAL,
+    Description,
+    FmuOptions,
+    Variable,
+    describe,
+    start_value,
+)
 from shmio.simulation.fmu.instance import FmuError, Group, Instance, Outputs
 from shmio.simulation.model import Model
 
@@ -33,12 +42,12 @@ def is_fmu(text: str) -> bool:
     return text.lower().endswith(SUFFIX)
 
 
-def load_fmu(file: Path, *, strict: bool = False) -> type[FmuModel]:
+def load_fmu(file: Path, options: FmuOptions = DEFAULTS) -> type[FmuModel]:
     """Return a model class for an FMU, without running any of the FMU's code.
 
     Args:
         file: The FMU.
-        strict: True to refuse a description with any formal defect.
+        options: How to read it.
 
     Raises:
         ModelError: The file is not an FMU that shmio can run on this machine.
@@ -46,16 +55,16 @@ def load_fmu(file: Path, *, strict: bool = False) -> type[FmuModel]:
     """
     try:
         archive = Archive(file)
-        return _model_of(archive, strict=strict, structure=NO_STRUCTURE)
+        return _model_of(archive, options, NO_STRUCTURE)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from None
 
 
-def _model_of(archive: Archive, *, strict: bool, structure: Mapping[str, int]) -> type[FmuModel]:
-    description = describe(archive, strict=strict, structure=structure)
+def _model_of(archive: Archive, options: FmuOptions, structure: Mapping[str, int]) -> type[FmuModel]:
+    description = describe(archive, options, structure)
     return FmuModel.with_declarations(
         archive.path.name, description.declarations, archive=archive, description=description,
-        notices=description.notices, strict=strict, structure=structure,
+        notices=description.notices, options=options, structure=structure,
     )  # fmt: skip
 
 
@@ -73,7 +82,7 @@ class FmuModel(Model):
 
     archive: ClassVar[Archive]
     description: ClassVar[Description]
-    strict: ClassVar[bool] = False
+    options: ClassVar[FmuOptions] = DEFAULTS
     structure: ClassVar[Mapping[str, int]] = NO_STRUCTURE
     """The values of structural parameters that the sizes of arrays depend on."""
 
@@ -102,7 +111,7 @@ class FmuModel(Model):
             if one.causality == STRUCTURAL and type(value := parameters.get(one.name)) is int
         }
         if structure != cls.structure:
-            model = _model_of(cls.archive, strict=cls.strict, structure=structure)
+            model = _model_of(cls.archive, cls.options, structure)
         variables = {one.name: one for one in model.description.variables}
         return model, {name: _declared(value, variables.get(name)) for name, value in parameters.items()}
 

@@ -89,6 +89,7 @@ def test_model_declares_its_registers(folder: Path) -> None:
         "connections": {},
         "folder": str(folder),
         "strict": False,
+        "text_length": 254,
     }
 
 

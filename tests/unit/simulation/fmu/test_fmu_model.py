@@ -22,6 +22,7 @@ from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.layout.values.write import Write
 from shmio.simulation import ModelRunner, load
+from shmio.simulation.fmu import FmuOptions
 from tests.fmus import build, build_oven, edited
 
 MS = 1_000_000
@@ -307,6 +308,7 @@ def test_an_fmu_of_pythonfmu3_equals_fmpy(tmp_path: Path) -> None:
     program = """
 import sys
 from shmio.simulation import ModelRunner, load
+from shmio.simulation.fmu import FmuOptions
 runner = ModelRunner(load(sys.argv[1]), parameters={"loss": 0.2})
 runner.connect({"power": 30.0})
 for number in range(1, 201):
@@ -357,7 +359,7 @@ def test_a_default_export_of_pythonfmu_runs_with_a_warning(folder: Path, tmp_pat
     assert (value(runner, "runs"), value(runner, "a%2Fb caption")) == (1, "small tank")
     runner.close()
     with pytest.raises(ModelError, match=r'invalid: The variable "pulses" \(line .*must have variability'):
-        load(str(file), strict=True)
+        load(str(file), None, FmuOptions(strict=True))
 
 
 @settings(max_examples=60)

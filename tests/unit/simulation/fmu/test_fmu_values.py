@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from shmio.layout.values.codec import codec
 from shmio.layout.values.write import encode
 from shmio.plan.sources import describe
 from shmio.simulation import ModelRunner, load
+from shmio.simulation.fmu import FmuOptions
 from tests.fmus import build, edited
 
 MS = 1_000_000
@@ -173,6 +175,23 @@ def test_texts_of_any_length_and_all_characters(run: Runner, folder: Path, tmp_p
     longer.step(20 * MS, 20 * MS)
     assert value(longer, "name_out") == "✓" * 1200
     longer.close()
+    sized = ModelRunner(load("line3.fmu", folder, FmuOptions(text_length=300)), parameters={"size": 3})
+    sized.connect({"name": "✓" * 300})
+    sized.step(20 * MS, 20 * MS)
+    assert value(sized, "name_out") == "✓" * 300
+    sized.close()
+
+
+def test_a_text_that_is_too_long_fails_the_step_with_the_remedy(run: Runner) -> None:
+    runner = run()
+    runner.connect({"mode": 7})  # each step adds to its calls
+    reasons = []
+    for number in range(1, 30):
+        try:
+            runner.step(number * 20 * MS, 20 * MS)
+        except ModelError as error:
+            reasons.append(str(error))
+    assert re.search(r"calls: WSTRING\[254\]: .*; the source needs text_length = \d{3}", reasons[0])
 
 
 PLAIN = 'variability="continuous"'
@@ -193,7 +212,7 @@ def test_formal_defects_that_touch_no_value_are_warnings(folder: Path, tmp_path:
         (defect, _) = load(str(file)).notices
         assert defect.startswith("modelDescription.xml breaks the standard, but no value depends on it: "), edit
         with pytest.raises(ModelError, match="is invalid"):
-            load(str(file), strict=True)
+            load(str(file), None, FmuOptions(strict=True))
         runner = ModelRunner(load(str(file)))
         runner.step(20 * MS, 20 * MS)
         assert value(runner, "sums") == [6.0, 15.0]
@@ -224,4 +243,4 @@ def test_defects_that_touch_a_value_are_refused(folder: Path, tmp_path: Path) ->
 
 def test_only_fmus_are_read_strictly() -> None:
     with pytest.raises(ConfigError, match="only for FMUs"):
-        load("shmio.simulation.loopback:Loopback", strict=True)
+        load("shmio.simulation.loopback:Loopback", None, FmuOptions(strict=True))
