@@ -11,6 +11,7 @@ from shmio.cli.common import add_json, complete, dumps, run
 from shmio.cli.layout_options import add_encoding, add_type_bytes, read_source
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
+from shmio.layout.encodings import UTF_16, WINDOWS_1252, canonical
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import Layout, Register
 from shmio.version import __version__
@@ -60,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _compile(options: argparse.Namespace) -> int:
     block, sizes = options.block, dict(options.type_bytes)
+    encoding = "" if options.encoding in (None, UTF_16) else canonical(options.encoding)
     program = Program([read_source(name, options.encoding) for name in (options.file, *options.types)])
     if block is not None and block.lower() not in {one.name.lower() for one in program.blocks}:
         program.compile(())  # reports damaged sources first
@@ -72,8 +74,9 @@ def _compile(options: argparse.Namespace) -> int:
     _complain(compiled.warnings)
     _complain(f"warning: --type-bytes: no member has the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:
-        _complain(_unread(layout))
-    _print(compiled.layouts, as_json=options.json)
+        _complain(_unread(layout.with_encoding(encoding or WINDOWS_1252)))
+    layouts = [one.with_encoding(encoding) if encoding else one for one in compiled.layouts]
+    _print(layouts, as_json=options.json)
     return 0
 
 

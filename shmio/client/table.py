@@ -136,6 +136,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
                 partial=bool(found.over) and found.HasField("bit") and len(found.dims) == 1,
                 unit=found.unit,
                 over=found.over,
+                encoding=found.encoding,
                 column=Column(found.column),
                 slot=found.slot,
             )

@@ -74,6 +74,7 @@ class Source(Section):
     tags: Text | Texts | None = None
     block: Text | None = None
     type_bytes: TypeBytes = {}
+    encoding: Text | None = None
     properties: Text | None = None
     period_ms: Annotated[float, Meta(ge=0.1, le=3_600_000)] = 20.0
     stale_ms: Milliseconds | None = None
@@ -110,6 +111,7 @@ class Emulator(Section):
     faults: bool = False
     block: Text | None = None
     type_bytes: TypeBytes = {}
+    encoding: Text | None = None
     dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's
     insecure: bool = False
     realtime_priority: RealtimePriority | None = None

@@ -56,7 +56,7 @@ class Source:
     file: str
     text: bytes
     encoding: str = ""
-    """Encoding of a text without byte order mark, one of :data:`shmio.layout.encodings.ENCODINGS`; "" if unknown."""
+    """Encoding of a text without byte order mark, one of :data:`shmio.layout.encodings.NAMES`; "" if unknown."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,11 @@ class Program:
         self.blocks: tuple[BlockName, ...] = ()
         with suppress(TooManyErrors):
             self._read(sources)
+
+    @property
+    def is_table(self) -> bool:
+        """True if the sources are a tag table, False if they declare data blocks."""
+        return self._table is not None
 
     def _read(self, files: Sequence[Source | Parsed]) -> None:
         report = self._general

@@ -13,6 +13,7 @@ from typing import Annotated
 import msgspec
 
 from shmio.errors import LayoutError, PathError
+from shmio.layout.encodings import NAMES as ENCODINGS
 from shmio.layout.model import (
     ALIASES,
     MAX_BLOCK_BYTES,
@@ -24,6 +25,7 @@ from shmio.layout.model import (
     Register,
     array_size,
     element_type,
+    is_encoded,
     shape_of,
     status_bytes,
 )
@@ -145,7 +147,7 @@ def _check(document: _Layout) -> None:
         if over:
             raise LayoutError(f"layout: {register.path!r} must come before the registers that lie over the block")
         bit = register.bit
-        shape = register.type, register.dims, register.size, register.count, bit, register.partial
+        shape = register.type, register.dims, register.size, register.count, bit, register.partial, register.encoding
         length = lengths.get(shape) or lengths.setdefault(shape, _length(register))
         first = register.offset * 8 + (bit or 0)
         if first < end:
@@ -223,6 +225,8 @@ def _kind(register: Register) -> tuple[int, int, bool]:
     element = element_type(register.type)
     if element is None or element.name != register.type or register.type in ALIASES:
         raise LayoutError(f"layout: {register.path!r} has the unknown type {register.type!r}")
+    if register.encoding and (register.encoding not in ENCODINGS or not is_encoded(register.type)):
+        raise LayoutError(f"layout: {register.path!r} has the unknown encoding {register.encoding!r}")
     if any(low > high for low, high in register.dims):
         raise LayoutError(f"layout: {register.path!r} has inverted bounds")
     shape = shape_of(register.dims)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import msgspec
 
 from shmio.errors import PathError
+from shmio.layout.encodings import ISO_8859_1
 
 ByteOrder = Literal["big", "little"]
 Dims = tuple[tuple[int, int], ...]
@@ -46,7 +47,9 @@ class ElementType(msgspec.Struct, frozen=True):
         base: The name without the length.
         size: Size in bytes; 1 for BOOL, which takes one bit of it.
         align: Alignment in bytes, 1 or 2.
-        length: Maximum number of characters of a string, 0 for all other types.
+        length: Maximum number of characters of a string, 0 for all other types. STRING counts bytes,
+            and WSTRING units of UTF-16.
+        encoding: Canonical name of the encoding of CHAR and STRING; "" is ISO 8859-1.
 
     """
 
@@ -55,6 +58,7 @@ class ElementType(msgspec.Struct, frozen=True):
     size: int
     align: int
     length: int = 0
+    encoding: str = ""
 
     @property
     def stride(self) -> int:
@@ -111,6 +115,11 @@ NUMBERS = INTEGERS | {"REAL", "LREAL"}
 _STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
 
 
+def is_encoded(name: str) -> bool:
+    """Return whether values of a type have the encoding of their register."""
+    return name == "CHAR" or name.startswith("STRING")
+
+
 def string_limit(base: str) -> int:
     """Return the largest length, in characters, that a ``STRING`` or ``WSTRING`` (``base``) may declare."""
     return _MAX_STRING if base == "STRING" else _MAX_WSTRING
@@ -130,6 +139,11 @@ def element_type(name: str) -> ElementType | None:
         return None
     size = length + 2 if base == "STRING" else 2 * length + 4
     return ElementType(f"{base}[{length}]", base, size, 2, length)
+
+
+@lru_cache(maxsize=1024)
+def _encoded(element: ElementType, encoding: str) -> ElementType:
+    return msgspec.structs.replace(element, encoding=encoding)
 
 
 _Path = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_PATH)]
@@ -172,6 +186,8 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
         writable: Whether the tag table lets commands write the register.
         over: For a register of a tag table over a data block, the path of the part of the block
             that it names; "" for a register that has bytes of its own.
+        encoding: Canonical name of the encoding of a CHAR or STRING; "" is ISO 8859-1, and for all
+            other types.
 
     """
 
@@ -191,6 +207,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     deadband: _Deadband = 0.0
     writable: bool = False
     over: Annotated[str, msgspec.Meta(max_length=MAX_PATH)] = ""
+    encoding: Annotated[str, msgspec.Meta(max_length=64)] = ""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -203,7 +220,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
         found = element_type(self.type)
         if found is None:
             raise KeyError(self.type)
-        return found
+        return _encoded(found, self.encoding) if self.encoding else found
 
 
 @dataclass(frozen=True)
@@ -315,7 +332,17 @@ class Layout:
             count=1,
             comment=register.comment,
             unit=register.unit,
+            encoding=register.encoding,
         )
+
+    def with_encoding(self, encoding: str) -> Layout:
+        """Return the layout with another encoding of its CHARs and STRINGs, given by its canonical name."""
+        name = "" if encoding == ISO_8859_1 else encoding
+        registers = (
+            msgspec.structs.replace(one, encoding=name) if one.encoding != name and is_encoded(one.type) else one
+            for one in self.registers
+        )
+        return replace(self, registers=tuple(registers))
 
     def with_statuses(self) -> Layout:
         """Return the layout with a status area after its registers; this layout if it has one already."""
@@ -349,8 +376,10 @@ class Layout:
         return msgspec.json.encode(self.describe() | {"byte_order": self.byte_order})
 
 
-_OF_TAGS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False, "over": ""}
-"""The keys that only registers of tag tables have, and their default values."""
+_OF_TAGS: Final = {
+    "unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False, "over": "", "encoding": "",
+}  # fmt: skip
+"""The keys that only some registers have, mostly those of tag tables, and their default values."""
 _tags_of: Final = operator.attrgetter(*_OF_TAGS)
 _NO_TAGS: Final = tuple(_OF_TAGS.values())
 

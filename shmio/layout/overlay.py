@@ -41,7 +41,7 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
     if element.name == named.type and (dims == named.dims or rows):
         return Register(
             path, named.type, dims, named.offset, named.bit, named.size, named.count,
-            partial=named.type == "BOOL" and len(dims) == 1, over=over,
+            partial=named.type == "BOOL" and len(dims) == 1, over=over, encoding=named.encoding,
         )  # fmt: skip
     whole = find(base, over.rpartition(".%")[0]) if named.type == "BOOL" and ".%X" in over else named
     if whole.type not in INTEGERS:

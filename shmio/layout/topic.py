@@ -320,8 +320,9 @@ def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int
     if first.bit is None:
         size = array_size(array.element, (count,))
         return Register(
-            path, array.type, ((low, high),), first.offset, None, size, count, array.comment, unit=array.unit
-        )
+            path, array.type, ((low, high),), first.offset, None, size, count, array.comment, unit=array.unit,
+            encoding=array.encoding,
+        )  # fmt: skip
     size = -(-(first.bit + count) // 8)
     return Register(
         path, "BOOL", ((low, high),), first.offset, first.bit, size, count, array.comment, partial=True

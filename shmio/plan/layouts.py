@@ -6,13 +6,16 @@ import os
 import re
 import stat
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from shmio.config import Config, Emulator, Source
-from shmio.errors import ConfigError, Diagnostic, LayoutError
+from shmio.errors import ConfigError, Diagnostic, LayoutError, ValueRangeError
 from shmio.layout import compiler
-from shmio.layout.model import Layout
+from shmio.layout.encodings import ISO_8859_1, WINDOWS_1252, canonical
+from shmio.layout.model import Layout, is_encoded
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
+from shmio.layout.values.literal import parse_literal
 from shmio.wording import unknown
 
 _QUOTED = re.compile(r"'[^']*'")
@@ -23,7 +26,7 @@ class LayoutFiles:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._programs: dict[tuple[Path, ...], compiler.Program] = {}
+        self._programs: dict[tuple[tuple[Path, ...], str], compiler.Program] = {}
         self._compiled: dict[object, compiler.Compiled | LayoutError] = {}
         self.warnings: list[str] = []
         self.odd: list[str] = []
@@ -74,9 +77,10 @@ class LayoutFiles:
             )
         names = [section.layout] if isinstance(section.layout, str) else section.layout
         paths = tuple(self._config.path(name) for name in names)
-        if paths not in self._programs:
-            self._programs[paths] = read_program(paths, f"{key}.layout: ")
-        return paths, self._programs[paths]
+        given = "" if section.encoding is None else encoding_of(key, section, table=False)
+        if (paths, given) not in self._programs:
+            self._programs[paths, given] = read_program(paths, f"{key}.layout: ", given)
+        return paths, self._programs[paths, given]
 
     def _compile(
         self,
@@ -90,10 +94,15 @@ class LayoutFiles:
     ) -> tuple[Layout, ...]:
         """Compile one block, or all blocks if ``block`` is None."""
         sizes = section.type_bytes
-        which = paths, block and block.lower(), tuple(sorted(sizes.items())), optimized
+        encoding = encoding_of(key, section, table=program.is_table)
+        which = paths, block and block.lower(), tuple(sorted(sizes.items())), optimized, encoding
         if which not in self._compiled:
             try:
-                self._compiled[which] = program.compile(None if block is None else (block,), sizes, by_name=optimized)
+                compiled = program.compile(None if block is None else (block,), sizes, by_name=optimized)
+                layouts = tuple(layout.with_encoding(encoding) for layout in compiled.layouts)
+                if program.is_table:
+                    _check_texts(key, layouts)
+                self._compiled[which] = replace(compiled, layouts=layouts)
             except LayoutError as error:
                 self._compiled[which] = error
         found = self._compiled[which]
@@ -105,6 +114,37 @@ class LayoutFiles:
         names = ", ".join(layout.name for layout in compiled.layouts)
         self.odd += [f"{key}.type_bytes: no member in {names} has the type {name!r}" for name in compiled.unused]
         return compiled.layouts
+
+
+def encoding_of(key: str, section: Source | Emulator, *, table: bool) -> str:
+    """Return the canonical name of the encoding of a section's texts: as configured, or as Siemens' tools have it.
+
+    Args:
+        key: The key of the section, for messages.
+        section: The section.
+        table: True if its registers come from a tag table or a model, False if from a data block.
+
+    Raises:
+        ConfigError: There is no such encoding.
+
+    """
+    if section.encoding is not None:
+        try:
+            return canonical(section.encoding)
+        except ValueError as error:
+            raise ConfigError(f"{key}.encoding: {error}") from None
+    kind = section.connector if isinstance(section, Source) else section.kind
+    return ISO_8859_1 if table and kind != "s7" else WINDOWS_1252
+
+
+def _check_texts(key: str, layouts: Iterable[Layout]) -> None:
+    """Raise ConfigError if the encoding cannot hold an initial value of a tag table."""
+    for register in (one for layout in layouts for one in layout.registers):
+        if register.initial is not None and is_encoded(register.type):
+            try:
+                parse_literal(register.initial, register)
+            except ValueRangeError as error:
+                raise ConfigError(f"{key}.encoding: {register.path}: initial: {error}") from None
 
 
 def _choose(
@@ -128,26 +168,38 @@ def _choose(
     return found[0]
 
 
-def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
+def read_program(paths: Iterable[Path], key: str = "", encoding: str = "") -> compiler.Program:
     """Read source files as one program, so that each file may use the types of the others.
+
+    ``encoding`` is that of files whose text is not UTF-8; "" if it is unknown.
 
     Raises:
         ConfigError: A file cannot be read; the message begins with ``key``.
         LayoutError: A tag table is invalid.
 
     """
-    return compiler.Program([_read(path, key) for path in paths])
+    return compiler.Program([_read(path, key, encoding) for path in paths])
 
 
-def _read(path: Path, key: str) -> compiler.Source:
+def _read(path: Path, key: str, encoding: str) -> compiler.Source:
     """Read a file. Of a file that is too large, read just enough that the compiler refuses it."""
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise ConfigError(f"{key}{path}: not a regular file; name the file of a data block")
-            return compiler.Source(str(path), file.read(MAX_SOURCE_BYTES + 4))
+            data = file.read(MAX_SOURCE_BYTES + 4)
     except OSError as error:
         raise ConfigError(f"{key}{path}: {error.strerror}") from None
+    return compiler.Source(str(path), data, "" if _is_utf8(data) else encoding)
+
+
+def _is_utf8(data: bytes) -> bool:
+    """Return whether bytes are text in UTF-8: many keep exports as UTF-8, whatever the controller has."""
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _open_at_once(path: str, flags: int) -> int:

@@ -295,7 +295,7 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config
 
 def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles) -> list[Served]:
     """Return the blocks and tag tables that sources read from an emulator without its own layout."""
-    for name in ("block", "dbNumber", "type_bytes"):
+    for name in ("block", "dbNumber", "type_bytes", "encoding"):
         if getattr(emulator, name):
             raise ConfigError(f"{key}.{name}: this key needs layout in the same section")
     blocks: dict[int | None, Layout] = {}

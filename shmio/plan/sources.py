@@ -19,12 +19,13 @@ from shmio.errors import ConfigError, PathError, RecordingError, RemoteError, Sh
 from shmio.fabric.connection import Access
 from shmio.fabric.place import Place, is_place, parse_place
 from shmio.layout.document import load_layout
+from shmio.layout.encodings import ISO_8859_1
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.topic import find, look_up, parse_topic
 from shmio.layout.values.codec import codec
 from shmio.local.replays import date_ns
-from shmio.plan.layouts import LayoutFiles
+from shmio.plan.layouts import LayoutFiles, encoding_of
 from shmio.plan.replay import Recordings
 from shmio.wording import near, unknown
 
@@ -194,7 +195,7 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
     """
     from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
 
-    for name in ("layout", "block", "type_bytes", "properties"):
+    for name in ("layout", "block", "type_bytes", "encoding", "properties"):
         if getattr(source, name):
             raise ConfigError(
                 f"{key}.{name}: leave out this key in a replay, because its registers are those of the recording"
@@ -272,6 +273,8 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
             raise ConfigError(f"{key}.{error}") from None
         files.odd.append(f"{key}.{error}; until then, nothing checks that the owner has the layout in {key}.layout")
         return own
+    if own is not None and source.encoding is None and _bytes_of(own) == _bytes_of(offer.layout):
+        own = offer.layout  # the owner knows the encoding
     if own is not None and not old and own.hash != offer.layout.hash:
         raise ConfigError(
             f"{key}.layout: {mirror} has another layout; use the owner's file, or remove this key: then the mirror "
@@ -283,6 +286,11 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
     return own or offer.layout
 
 
+def _bytes_of(layout: Layout) -> bytes:
+    """Return the hash of a layout without the encodings of its texts."""
+    return layout.with_encoding(ISO_8859_1).hash
+
+
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
     """Return the layout of a simulation's block, from files or from its model, and the paths of its inputs."""
     from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415  loads numpy
@@ -291,7 +299,7 @@ def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tupl
     layout = None if source.layout is None else files.get(key, source, None)
     found, inputs, notices = describe(key, msgspec.convert(source.options, Simulation.Options), layout)
     files.odd += [f"{key}.model: {notice}" for notice in notices]
-    return found, inputs
+    return found.with_encoding(encoding_of(key, source, table=True)) if layout is None else found, inputs
 
 
 def describe(

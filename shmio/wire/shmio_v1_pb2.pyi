@@ -108,7 +108,7 @@ class LayoutPart(_message.Message):
     def __init__(self, source: _Optional[str] = ..., section: _Optional[int] = ..., name: _Optional[str] = ..., number: _Optional[int] = ..., size: _Optional[int] = ..., big_endian: bool = ..., hash: _Optional[bytes] = ..., period_ns: _Optional[int] = ..., stale_ns: _Optional[int] = ..., writable: _Optional[_Iterable[str]] = ..., armed: bool = ..., optimized: bool = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., last: bool = ..., status_offset: _Optional[int] = ...) -> None: ...
 
 class Register(_message.Message):
-    __slots__ = ("path", "type", "dims", "offset", "bit", "size", "count", "column", "slot", "comment", "initial", "unit", "over")
+    __slots__ = ("path", "type", "dims", "offset", "bit", "size", "count", "column", "slot", "comment", "initial", "unit", "over", "encoding")
     PATH_FIELD_NUMBER: _ClassVar[int]
     TYPE_FIELD_NUMBER: _ClassVar[int]
     DIMS_FIELD_NUMBER: _ClassVar[int]
@@ -122,6 +122,7 @@ class Register(_message.Message):
     INITIAL_FIELD_NUMBER: _ClassVar[int]
     UNIT_FIELD_NUMBER: _ClassVar[int]
     OVER_FIELD_NUMBER: _ClassVar[int]
+    ENCODING_FIELD_NUMBER: _ClassVar[int]
     path: str
     type: str
     dims: _containers.RepeatedCompositeFieldContainer[Bounds]
@@ -135,7 +136,8 @@ class Register(_message.Message):
     initial: str
     unit: str
     over: str
-    def __init__(self, path: _Optional[str] = ..., type: _Optional[str] = ..., dims: _Optional[_Iterable[_Union[Bounds, _Mapping]]] = ..., offset: _Optional[int] = ..., bit: _Optional[int] = ..., size: _Optional[int] = ..., count: _Optional[int] = ..., column: _Optional[_Union[Column, str]] = ..., slot: _Optional[int] = ..., comment: _Optional[str] = ..., initial: _Optional[str] = ..., unit: _Optional[str] = ..., over: _Optional[str] = ...) -> None: ...
+    encoding: str
+    def __init__(self, path: _Optional[str] = ..., type: _Optional[str] = ..., dims: _Optional[_Iterable[_Union[Bounds, _Mapping]]] = ..., offset: _Optional[int] = ..., bit: _Optional[int] = ..., size: _Optional[int] = ..., count: _Optional[int] = ..., column: _Optional[_Union[Column, str]] = ..., slot: _Optional[int] = ..., comment: _Optional[str] = ..., initial: _Optional[str] = ..., unit: _Optional[str] = ..., over: _Optional[str] = ..., encoding: _Optional[str] = ...) -> None: ...
 
 class Bounds(_message.Message):
     __slots__ = ("low", "high")

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal
 
+from shmio.layout.encodings import text_encoding
 from shmio.layout.model import ElementType, Register, element_type
-from shmio.layout.values.codec import Scalar
+from shmio.layout.values.codec import Scalar, encode_text
 
 Order = Literal["big", "little"]
 MAX_ADDRESS: Final = 65_535
@@ -172,12 +173,13 @@ class WordCodec:
         )
         self.masks: Final = struct.unpack(f">{address.width}H", self.ordered(own))
         """For each word of an element, the bits that the element takes. The rest belongs to something else."""
+        self._encoding = text_encoding(register.encoding)
 
     def decode(self, data: bytes) -> Scalar:
         """Return an element's value. ``data`` are the element's words as the device sent them."""
         data = self.ordered(data)
         if self._text:
-            return data[: self._length].partition(b"\0")[0].decode("latin-1")
+            return self._encoding.decode(data[: self._length].partition(b"\0")[0])
         number: int | float = self._struct.unpack(data)[0]
         value = number if self._scale is None else number * self._scale[0] + self._scale[1]
         return round(value) if self._whole and math.isfinite(value) else value
@@ -185,9 +187,9 @@ class WordCodec:
     def encode(self, value: Scalar) -> bytes:
         """Return a value as words to send; raise ValueError if the device's type cannot hold it."""
         if self._text:
-            data = str(value).encode("latin-1", "replace")
+            data = encode_text(value, self._encoding, self._name)
             if len(data) > self._length:
-                raise ValueError(f"the device's {self._name} holds {self._length} characters, not {len(data)}")
+                raise ValueError(f"the device's {self._name} holds {self._length} bytes, not {len(data)}")
             return self.ordered(data.ljust(self._bytes, b"\0"))
         if not isinstance(value, int | float):
             raise TypeError(f"{value!r} is not a number")

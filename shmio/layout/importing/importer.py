@@ -40,7 +40,7 @@ def import_tags(
         further: For XML of TIA Portal Openness, files with types, function blocks and constants that
             the data blocks use.
         encoding: Encoding of a text without byte order mark, one of
-            :data:`shmio.layout.encodings.ENCODINGS`; "": UTF-8, or else Windows-1252 with a remark.
+            :data:`shmio.layout.encodings.NAMES`; "": UTF-8, or else Windows-1252 with a remark.
         type_bytes: Sizes in bytes of types whose members are unknown, by name.
         by_name: True to leave out the addresses of data blocks, because the members are read by name.
 

@@ -53,7 +53,7 @@ def decode(data: bytes, encoding: str = "") -> Decoded:
     """Decode a source: by its byte order mark, or else as ``encoding``.
 
     If ``encoding`` is empty, decode the source as UTF-8, or else as Windows-1252. Otherwise it is the
-    name of one of :data:`shmio.layout.encodings.ENCODINGS`.
+    name of one of :data:`shmio.layout.encodings.NAMES`.
     """
     given = encoding
     mark, encoding = next(

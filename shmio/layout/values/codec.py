@@ -4,8 +4,8 @@
 BOOL                                 bool
 BYTE … LWORD, SINT … ULINT           int
 REAL, LREAL                          float
-CHAR, STRING                         str, ISO 8859-1, so that every byte has its character
-WCHAR, WSTRING                       str, UTF-16; a lone surrogate reads as U+FFFD
+CHAR, STRING                         str, in the register's encoding; every byte has a character, or a stand-in
+WCHAR, WSTRING                       str, UTF-16; a lone surrogate has a stand-in
 TIME, S5TIME                         int, milliseconds
 LTIME                                int, nanoseconds
 TIME_OF_DAY                          int, milliseconds since midnight
@@ -37,6 +37,7 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 from shmio.errors import CharacterError, ValueRangeError
+from shmio.layout.encodings import TextEncoding, text_encoding
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values import calendar
 from shmio.wording import brief
@@ -260,15 +261,15 @@ _CODES = {
 def scalar_codec(element: ElementType, byte_order: str = "big") -> ScalarCodec:
     """Return the codec of one element of any type except BOOL."""
     base, order = element.base, ">" if byte_order == "big" else "<"
-    utf16 = "utf-16-be" if byte_order == "big" else "utf-16-le"
+    utf16 = text_encoding("utf-16-be" if byte_order == "big" else "utf-16-le")
     if base in _CODES:
         return _Number(base, order, _CODES[base])
     factories: dict[str, Callable[[], ScalarCodec]] = {
         "TIME_OF_DAY": lambda: _Number(base, order, "I", MAX_TOD_MS),
         "LTOD": lambda: _Number(base, order, "Q", MAX_LTOD_NS),
-        "CHAR": lambda: _Text(base, "latin-1", 1),
+        "CHAR": lambda: _Text(base, text_encoding(element.encoding), 1),
         "WCHAR": lambda: _Text(base, utf16, 2),
-        "STRING": lambda: _String(element, order, "latin-1", 1),
+        "STRING": lambda: _String(element, order, text_encoding(element.encoding), 1),
         "WSTRING": lambda: _String(element, order, utf16, 2),
         "S5TIME": lambda: _S5Time(order),
         **dict.fromkeys(("DATE", "DATE_AND_TIME", "LDT", "DTL"), lambda: _moment_codec(base, order)),
@@ -318,14 +319,14 @@ class _Text:
 
     plain = ""
 
-    def __init__(self, name: str, encoding: str, size: int) -> None:
+    def __init__(self, name: str, encoding: TextEncoding, size: int) -> None:
         self._name, self._encoding, self._size = name, encoding, size
 
     def decode(self, data: Buffer, offset: int) -> str:
-        return bytes(data[offset : offset + self._size]).decode(self._encoding, "replace")
+        return self._encoding.decode(bytes(data[offset : offset + self._size]))
 
     def encode(self, value: object) -> bytes:
-        data = _encode_text(value, self._encoding, self._name)
+        data = encode_text(value, self._encoding, self._name)
         if len(data) != self._size:
             raise ValueRangeError(f"{self._name}: expected one character, found {brief(value)}")
         return data
@@ -336,7 +337,7 @@ class _String:
 
     plain = ""
 
-    def __init__(self, element: ElementType, order: str, encoding: str, unit: int) -> None:
+    def __init__(self, element: ElementType, order: str, encoding: TextEncoding, unit: int) -> None:
         self._name, self._length, self._size = element.name, element.length, element.size
         self._head = struct.Struct(order + ("BB" if unit == 1 else "HH"))
         self._encoding, self._unit = encoding, unit
@@ -348,15 +349,15 @@ class _String:
         if actual > self._length:
             return None
         start = offset + self._head.size
-        return bytes(data[start : start + actual * self._unit]).decode(self._encoding, "replace")
+        return self._encoding.decode(bytes(data[start : start + actual * self._unit]))
 
     def encode(self, value: object) -> bytes:
-        text = _encode_text(value, self._encoding, self._name)
+        text = encode_text(value, self._encoding, self._name)
         actual = len(text) // self._unit
         if actual > self._length:
-            raise ValueRangeError(
-                f"{self._name}: the text has {actual} characters, but at most {self._length} are allowed"
-            )
+            units = "bytes" if self._unit == 1 else "units of UTF-16"
+            what = "characters" if actual == len(str(value)) else units
+            raise ValueRangeError(f"{self._name}: the text has {actual} {what}, but at most {self._length} are allowed")
         return (self._head.pack(self._length, actual) + text).ljust(self._size, b"\0")
 
 
@@ -579,7 +580,7 @@ def to_bool(value: object, name: str) -> bool:
     raise ValueRangeError(f"{name}: expected true or false, found {brief(value)}")
 
 
-def _encode_text(value: object, encoding: str, name: str) -> bytes:
+def encode_text(value: object, encoding: TextEncoding, name: str) -> bytes:
     """Encode a text.
 
     Raises:
@@ -590,14 +591,12 @@ def _encode_text(value: object, encoding: str, name: str) -> bytes:
     if not isinstance(value, str):
         raise ValueRangeError(f"{name}: expected text, found {brief(value)}")
     try:
-        return value.encode(encoding)
-    except UnicodeEncodeError as error:
-        character, place = value[error.start], error.start + 1
-        raise CharacterError(
-            f"{name}: the register's encoding ({encoding}) cannot hold {character!r}, character {place} of the text",
-            character,
-            place,
-        ) from None
+        return encoding.encode(value)
+    except UnicodeEncodeError:
+        at = encoding.missing(value)
+        character, place = value[at], at + 1
+        what = f"the register's encoding ({encoding.name}) cannot hold {character!r}, character {place} of the text"
+        raise CharacterError(f"{name}: {what}", character, place) from None
 
 
 def out_of_range(value: object, name: str, least: object, most: object) -> ValueRangeError:

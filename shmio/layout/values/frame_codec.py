@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shmio.layout.encodings import UNIT_STAND_INS, TextEncoding, text_encoding
 from shmio.layout.model import ElementType, Layout, Register, bit_positions
 from shmio.layout.values.calendar import DATE_EPOCH_DAYS, FIRST_DT_NS, LAST_DT_NS, NS_PER_DAY, NS_PER_MS, NS_PER_SECOND
 from shmio.layout.values.codec import MAX_LTOD_NS, MAX_TOD_MS
@@ -168,9 +169,9 @@ def _element_decoder(element: ElementType, order: str) -> _Decode:
         "DATE_AND_TIME": _date_and_time,
         "LDT": lambda raw: _not_negative(_view(raw, f"{order}i8").astype(np.int64)).view("M8[ns]"),
         "DTL": lambda raw: _dtl(raw, order),
-        "CHAR": lambda raw: _view(raw.astype(np.uint32), "U1"),
+        "CHAR": lambda raw: _characters(raw, text_encoding(element.encoding)),
         "WCHAR": lambda raw: _utf16(_view(raw, wide)[..., None]),
-        "STRING": lambda raw: _text(raw[..., 2:], raw[..., 1]).view(f"U{element.length}")[..., 0],
+        "STRING": lambda raw: _string(raw, element.length, text_encoding(element.encoding)),
         "WSTRING": lambda raw: _wide_text(np.ascontiguousarray(raw).view(wide), element.length),
         "POINTER": lambda raw: _view(raw, "V6"),
         "ANY": lambda raw: _view(raw, "V10"),
@@ -243,9 +244,26 @@ def _text(units: Array, actual: Array) -> Array:
     return np.ascontiguousarray(np.where(inside, units, 0).astype(np.uint32))
 
 
+def _characters(raw: Bytes, encoding: TextEncoding) -> Array:
+    """Return bytes (…, 1) as single characters."""
+    points = [ord(encoding.decode(bytes((byte,)))) for byte in range(256)]
+    return _view(np.array(points, np.uint32)[raw], "U1")
+
+
+def _string(raw: Bytes, length: int, encoding: TextEncoding) -> Array:
+    """Return STRINGs (…, 2 + length) as texts."""
+    if encoding.points:
+        points = np.array([*map(ord, encoding.points)], np.uint32)
+        return _text(points[raw[..., 2:]], raw[..., 1]).view(f"U{length}")[..., 0]
+    flat = raw.reshape(-1, raw.shape[-1])
+    texts = [encoding.decode(bytes(row[2 : 2 + row[1]])) if row[1] <= length else "" for row in flat]
+    return np.array(texts, f"U{length}").reshape(raw.shape[:-1])
+
+
 def _utf16(units: Array) -> Array:
-    """Return (…, 1) UTF-16 units as single characters; lone surrogates become U+FFFD."""
-    points = np.where((units >= 0xD800) & (units <= 0xDFFF), 0xFFFD, units)
+    """Return (…, 1) UTF-16 units as single characters; lone surrogates become stand-ins."""
+    points = units.astype(np.uint32)
+    points = np.where((units >= 0xD800) & (units <= 0xDFFF), points + (UNIT_STAND_INS - 0xD800), points)
     return _view(points.astype(np.uint32), "U1")
 
 
@@ -256,5 +274,5 @@ def _wide_text(words: Array, length: int) -> Array:
     # A surrogate pair is one character, so the text gets shorter. Such texts are rare; convert each alone.
     flat = points.reshape(-1, length).astype("<u2")
     actual = np.where(words[..., 1] <= length, words[..., 1], 0).reshape(-1)
-    texts = [bytes(row[:n]).decode("utf-16-le", "replace") for row, n in zip(flat, actual, strict=True)]
+    texts = [text_encoding("utf-16-le").decode(bytes(row[:n])) for row, n in zip(flat, actual, strict=True)]
     return np.array(texts, dtype=f"U{length}").reshape(points.shape[:-1])

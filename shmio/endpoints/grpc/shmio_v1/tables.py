@@ -755,7 +755,7 @@ def describe(register: Register, found: wire.Register, column: Column | None = N
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]
-    found.slot, found.unit = slot, register.unit
+    found.slot, found.unit, found.encoding = slot, register.unit, register.encoding
     if register.bit is not None:
         found.bit = register.bit
     for low, high in register.dims:
