@@ -10,7 +10,7 @@ import math
 from functools import cache
 
 from shmio.errors import LayoutError, ValueRangeError
-from shmio.layout.compiler import Compiled, Source, compile_sources
+from shmio.layout.compiler import Compiled, Program, Source, compile_sources
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame, unread
 from shmio.layout.model import Layout, Register
@@ -44,6 +44,8 @@ def check_sources(data: bytes) -> None:
         frame, missing = initial_frame(layout)
         assert [register.path for register in unread(layout)] == list(missing)
         _check_frame(layout, bytes(frame))
+    for layout in Program(sources).compile(by_name=True).layouts:
+        assert load_layout(layout.to_json()) == layout
 
 
 def _outcome(sources: list[Source]) -> Compiled | LayoutError:

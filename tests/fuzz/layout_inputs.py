@@ -11,6 +11,7 @@ from shmio.layout.compiler import Source, compile_sources
 from tests.fuzz.layout_checks import SPLIT
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "layout"
+FIELD = GOLDEN.parents[1] / "field"
 MAX_INPUT = 8192  # bytes; larger ones cost time and find nothing more
 FRAGMENTS = [
     *('DATA_BLOCK "b"', "DATA_BLOCK DB 1", 'TYPE "t"', "TYPE UDT 1", 'FUNCTION_BLOCK "f"', "FUNCTION_BLOCK FB 1"),
@@ -22,6 +23,8 @@ FRAGMENTS = [
     *("+", "-", "*", "0", "1", "-5", "16#FF", "99999", "2147483647", "4294967296", "1.5", "'x'", "''", "'$'", "(())"),
     *("3(0)", "9999999999(1)", "(a := 1)", "[()]", "[1, 2(3)]", "Array[0..1] of", "Array[0..N] of", "Array[*] of"),
     *("Struct", "Bool", "Int", "Real", "String[3]", "String[N]", "WString", "DTL", "Date_And_Time", "S5Time", "Any"),
+    *('{ S7_Optimized := "FALSE"; S7_BlockNumber := "5" }', '{ S7_MLC := "" }', "TYPE t : STRUCT", "DATA_BLOCK b : t"),
+    *("_.t", '"u"."t"', "_.N", "TON_TIME", "CTU_INT", "TCON", "END_NETWORK"),
     *("Variant", "IEC_TIMER", "TON", "SFB 4", "UDT 1", "FB 1", "ErrorStruct", "Timer", "T#1s", "DT#90-1-1-0:0:0"),
     *(
         "TRUE",
@@ -108,6 +111,7 @@ SHAPES = (
 def seeds() -> list[bytes]:
     """Return the golden files, singly and together, and the JSON of their layouts."""
     texts = [path.read_bytes() for path in sorted((GOLDEN / "rules").iterdir())]
+    texts += [b"".join(path.read_bytes() for path in sorted((FIELD / "s7").glob("*.s7dcl")))]
     small = [text[:MAX_INPUT] for text in texts]
     found = [b"\0" + text for text in small]
     found += [b"\0" + SPLIT.join((one, other))[:MAX_INPUT] for one, other in itertools.pairwise(small)]

@@ -417,6 +417,9 @@ def _check_import(data: bytes) -> None:
         found = import_tags(data)
         if found.tags:
             importers.summary(found)
+    for encoding in ("gbk", "utf-16"):
+        with suppress(ImportingError):
+            import_tags(data, further=importers.FURTHER, encoding=encoding, by_name=True)
 
 
 def _uploads() -> list[bytes]:

@@ -349,7 +349,10 @@ def test_the_command_writes_a_table_and_a_report(tmp_path: Path, capsys: pytest.
     assert main(["import", str(tmp_path / "none")]) == 1
 
 
+FIELD = Path(__file__).parents[3] / "field"
+FURTHER = [Source(name, (FIELD / "s7" / name).read_bytes()) for name in ("ml_udt_type.xml", "simatic_sd_type.s7dcl")]
 SAMPLES = [tia_workbook(), SDF.encode("cp1252"), KEP.encode(), TAG_XML.encode(), DB_XML.encode(), NODES.encode()]
+SAMPLES += [path.read_bytes() for path in sorted(FIELD.glob("*/*")) if path.suffix in (".xml", ".sdf", ".csv")]
 
 
 @given(
