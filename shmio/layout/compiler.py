@@ -35,6 +35,8 @@ from shmio.layout.source.syntax import (
 )
 from shmio.wording import larger_than
 
+SUFFIXES = (".db", ".udt", ".scl", ".awl", ".s7dcl")
+"""Suffixes of sources of data blocks."""
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
 """Maximum number of structures in all blocks compiled together: a small source can declare many large blocks."""

@@ -32,13 +32,14 @@ _INSTEAD: Final = (
 )
 _CONVERT: Final = "'shmio-layout import' makes a tag table of it; for a data block, "
 _MICROWIN: Final = re.compile(r"^[ \t]*V[BWD]?[0-9]{1,5}(?:\.[0-7])?[ \t]+[^\s:]", re.MULTILINE)
+_MEMBERS: Final = re.compile(r"\b(?:STRUCT|VAR|VAR_INPUT|VAR_OUTPUT)\b", re.IGNORECASE)
 _MC7_MAGIC: Final = b"pp"
 _MC7_TEXT: Final = re.compile(r"\s*(?:0x)?70[\s,]*(?:0x)?70(?:[\s,]*(?:0x)?[0-9A-Fa-f]{2}){6}")
 _ZIP: Final = b"PK\x03\x04"
 _OLD_OFFICE: Final = b"\xd0\xcf\x11\xe0"
 _CONTROLS: Final = bytes({*range(32)} - {*b"\t\n\f\r"})
 _MARKUP: Final = re.compile(r"\s*<[?!A-Za-z]")
-_SOURCE: Final = re.compile(r"\b(?:DATA_BLOCK|END_TYPE|FUNCTION_BLOCK|END_VAR)\b", re.IGNORECASE)
+SOURCE: Final = re.compile(r"\b(?:DATA_BLOCK|END_TYPE|FUNCTION_BLOCK|END_VAR)\b", re.IGNORECASE)
 _SEPARATORS: Final = re.compile(r"[;,\t]")
 FIXED: Final = "126,"
 """Start of each line of an ``.asc`` file; columns of 24, 12, 10 and 80 characters follow."""
@@ -49,11 +50,13 @@ COLUMNS: Final = {
 }
 """The columns of a list without a header row, by their number; nine are those of TIA Portal."""
 HEADINGS: Final = {
-    "name": "name", "symbol": "name", "address": "address", "logical address": "address", "logische adresse": "address",
-    "adresse": "address", "data type": "type", "datatype": "type", "datentyp": "type", "type": "type",
-    "comment": "comment", "kommentar": "comment", "hmi writeable": "writable", "hmi writable": "writable",
-}  # fmt: skip
-"""What a header row calls the columns."""
+    **dict.fromkeys(("name", "symbol", "tagname", "symbolname"), "name"),
+    **dict.fromkeys(("address", "logicaladdress", "logischeadresse", "adresse", "addr", "operand"), "address"),
+    **dict.fromkeys(("datatype", "datentyp", "type", "typ"), "type"),
+    **dict.fromkeys(("comment", "kommentar", "remark", "bemerkung"), "comment"),
+    **dict.fromkeys(("hmiwriteable", "hmiwritable"), "writable"),
+}
+"""What a header row calls the columns, in lower case and without spaces."""
 OPERAND: Final = re.compile(r"(?:OB|FB|FC|DB|SFB|SFC|UDT|VAT|DI)\s*[0-9]{1,5}", re.IGNORECASE)
 MAX_PROBED: Final = 200  # lines that decide about the format
 
@@ -117,7 +120,12 @@ def _is_list(text: str) -> bool:
 
 def is_header(cells: Sequence[str]) -> bool:
     """Return whether a row names the columns of a list of symbols."""
-    return {"name", "address"} <= {HEADINGS.get(cell.lower()) for cell in cells}
+    return {"name", "address"} <= {*headings(cells)}
+
+
+def headings(cells: Sequence[str]) -> list[str]:
+    """Return the name of each column of a header row; "" for a column of no interest."""
+    return [HEADINGS.get(re.sub(r"[\s_.-]", "", cell).lower(), "") for cell in cells]
 
 
 def _has_operand(line: str) -> bool:
@@ -146,9 +154,12 @@ def foreign(file: str, data: bytes) -> str:
         return f"this is XML, not the source of a data block; {_conversion(data)}{_INSTEAD}"
     if name.endswith((".csv", ".sdf", ".tsv")) or _is_table(text, data):
         return f"this is a table of tags without their places in a data block; {_conversion(data)}{_INSTEAD}"
-    if head.startswith(_MC7_MAGIC) or _MC7_TEXT.match(text):
+    is_binary = len(head) - len(head.translate(None, _CONTROLS)) > 0
+    if (head.startswith(_MC7_MAGIC) and is_binary) or _MC7_TEXT.match(text) or name.endswith((".mc7", ".wld")):
         return f"this is a compiled block (MC7), which has no names; {_INSTEAD}"
-    if _MICROWIN.search(text):
+    if text.startswith("MultiLingualTexts:"):
+        return "these are the texts of a source in SIMATIC SD (.s7res), which shmio does not read; leave out this file"
+    if _MICROWIN.search(text) and not _MEMBERS.search(text):
         return (
             "this is a data block of STEP 7-Micro/WIN (S7-200), which gives values to addresses and declares no "
             "members; write a tag table with addresses such as DB1.DBW0, because V memory is DB1"
@@ -175,7 +186,7 @@ def misplaced_list(file: str, data: bytes) -> str:
 def _is_table(text: str, data: bytes) -> bool:
     """Return whether the text looks like a table of separated values and declares no block."""
     lines = [line for line in text.splitlines() if line.strip()][:3]
-    if len(lines) < 2 or ":" in lines[0] or _SOURCE.search(decode(data).text):
+    if len(lines) < 2 or ":" in lines[0] or SOURCE.search(decode(data).text):
         return False
     counts = [len(_SEPARATORS.findall(line)) for line in lines]
     return counts[0] >= 2 and len({*counts[:2]}) == 1

@@ -41,7 +41,11 @@ class WorkbookError(ShmioError):
         self.row = row
 
 
-def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Row]:
+def read_rows(
+    data: bytes,
+    choose: Callable[[list[str]], str | None],
+    refuse: Callable[[WorkbookError], None] | None = None,
+) -> list[Row]:
     """Return the rows of one sheet, without empty rows.
 
     Cells right of column ``MAX_COLUMNS`` are ignored. The value of a formula is the one that Excel
@@ -50,6 +54,7 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
     Args:
         data: Contents of the file.
         choose: Returns the name of the sheet to read, given all names; None if it is missing.
+        refuse: Called for a row with a wrong cell, which is left out; None: such a row is an error.
 
     Raises:
         WorkbookError: openpyxl is missing, or the file is not a workbook, too large, or lacks the
@@ -70,7 +75,7 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
             if name is None:
                 listed = ", ".join(names[:20]) or "none"
                 raise WorkbookError(f"the workbook has no sheet of this name; it has: {listed}")
-            return list(_rows(book, name))
+            return list(_rows(book, name, refuse))
     except WorkbookError:
         raise
     except Exception as error:  # noqa: BLE001  (openpyxl raises whatever its parsers raise)
@@ -91,7 +96,7 @@ def _check_archive(data: bytes) -> None:
         raise WorkbookError(f"the workbook unpacks to more than {MAX_UNPACKED_BYTES} bytes")
 
 
-def _rows(book: Workbook, name: str) -> Iterator[Row]:
+def _rows(book: Workbook, name: str, refuse: Callable[[WorkbookError], None] | None) -> Iterator[Row]:
     sheet = book[name]
     reset = getattr(sheet, "reset_dimensions", None)
     if reset is not None:
@@ -99,7 +104,12 @@ def _rows(book: Workbook, name: str) -> Iterator[Row]:
     cells = sheet.iter_rows(max_col=MAX_COLUMNS, max_row=MAX_ROWS, values_only=True)
     for number, row in enumerate(cells, 1):
         if any(cell is not None for cell in row):
-            yield number, [_text(cell, number, column) for column, cell in enumerate(row)]
+            try:
+                yield number, [_text(cell, number, column) for column, cell in enumerate(row)]
+            except WorkbookError as error:
+                if refuse is None:
+                    raise
+                refuse(error)
 
 
 def _text(cell: object, row: int, column: int) -> str:

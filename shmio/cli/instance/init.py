@@ -25,6 +25,7 @@ from shmio.config.read import SECTION_PROCESSES, read_properties, read_tables
 from shmio.config.web import check_library
 from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError
+from shmio.layout.compiler import SUFFIXES as SOURCES
 from shmio.layout.compiler import Program
 from shmio.layout.foreign import HEAD_BYTES, foreign
 from shmio.layout.model import Layout
@@ -35,7 +36,6 @@ from shmio.wording import printable, unknown
 
 EXAMPLE = ("supervisor.toml", "db201.db", "scene.toml")
 EXAMPLE_NAME = "a50"
-SOURCES = (".db", ".udt", ".scl", ".awl")
 TABLES = (".toml", ".csv", ".xlsx")
 """File name endings of tag tables."""
 LISTS = (".csv", ".xlsx", ".sdf", ".asc", ".seq")

@@ -19,6 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from shmio.errors import CommandError, EndpointError, LayoutError
+from shmio.layout.compiler import SUFFIXES as SOURCES
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.importing.importer import import_tags
@@ -48,7 +49,6 @@ LIMIT_S: Final = 30
 """Maximum time in s that compiling files may take."""
 MEMORY_BYTES: Final = 1 << 30
 """Maximum address space of the process that compiles, in bytes."""
-_SOURCES: Final = (".db", ".udt", ".awl", ".scl")
 
 _Name = Annotated[str, Meta(min_length=1, max_length=255)]
 _Bytes = Annotated[int, Meta(ge=0, le=MAX_BYTES)]
@@ -178,28 +178,30 @@ def _files(body: bytes) -> Iterator[Source]:
 
 
 def _compile(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
-    """Compile files as ``shmio-layout`` does; import a single file that is a tag list of another tool.
+    """Compile files as ``shmio-layout`` does; import a file that is a tag list of another tool.
 
     Raises:
         LayoutError: The files can neither be compiled nor imported.
 
     """
-    single = files[0] if len(files) == 1 and not files[0].file.lower().endswith(_SOURCES) else None
-    if single is not None and not single.file.lower().endswith(SUFFIXES) and (found := _import(single)) is not None:
+    suffix = files[0].file.lower()
+    is_list = not suffix.endswith(SOURCES) and (len(files) == 1 or suffix.endswith(".xml"))
+    if is_list and not suffix.endswith(SUFFIXES) and (found := _import(files)) is not None:
         return found
     try:
         compiled = compile_sources(files)
     except LayoutError:
-        if single is not None and (found := _import(single)) is not None:
+        if is_list and (found := _import(files)) is not None:
             return found
         raise
     return compiled.layouts, [str(warning) for warning in compiled.warnings]
 
 
-def _import(file: Source) -> tuple[Sequence[Layout], list[str]] | None:
-    """Import a tag list of another tool; return None if the file is not such a list."""
+def _import(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]] | None:
+    """Import a tag list of another tool, with the files of its types; return None if it is not such a list."""
+    file, *further = files
     try:
-        found: Found = import_tags(file.text)
+        found: Found = import_tags(file.text, file.file, further=further)
     except ImportingError:
         return None
     layouts = [place_tags(PurePath(file.file).stem or "tags", found.tags)] if found.tags else []

@@ -31,7 +31,9 @@ IDENTIFIER: Final = "shmio_cell"
 MAX_BYTES: Final = 64 << 20
 COMPILE_S: Final = 120
 """Time limit in s for the C compiler."""
-SUFFIXES: Final = frozenset({".toml", ".db", ".udt", ".scl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"})
+SUFFIXES: Final = frozenset(
+    {".toml", ".db", ".udt", ".scl", ".awl", ".s7dcl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"}
+)
 """Suffixes of the files that are copied from the configuration's folder to the FMU."""
 _SKIPPED: Final = frozenset({"__pycache__", "node_modules", "logs", "dumps", "snapshots", "build", "dist"})
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

@@ -18,6 +18,7 @@ from shmio.wording import counted, printable
 MAX_TEXT: Final = 1000
 _MAX_UNIT: Final = 64
 _NAMES_SHOWN: Final = 1000
+_REMARKS_SHOWN: Final = 1000
 
 
 class ImportingError(ShmioError):
@@ -130,7 +131,9 @@ class Found:
             yield f"skipped {len(items)}: {why}: {shown}{more}"
         if self._read_only:
             yield f"not writable: {counted(self._read_only, 'tag')}, because there are inputs at their addresses"
-        yield from self.remarks
+        yield from self.remarks[:_REMARKS_SHOWN]
+        if len(self.remarks) > _REMARKS_SHOWN:
+            yield f"and {len(self.remarks) - _REMARKS_SHOWN} more remarks like these"
 
     def to_toml(self, source: str, *, writable: bool) -> str:
         """Return the tag table as TOML.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from shmio.layout.compiler import Source
-from shmio.layout.foreign import FORMATS, Format, format_of
+from shmio.layout.foreign import FORMATS, SOURCE, Format, format_of
 from shmio.layout.importing import (
     kepserver,
     node_set,
@@ -55,24 +55,38 @@ def import_tags(
     if len(data) > MAX_BYTES:
         raise ImportingError(larger_than(MAX_BYTES))
     if data.startswith(b"PK"):
+        text, root = "", None
+    else:
+        decoded = decode(data, encoding)
+        if decoded.fatal:
+            raise ImportingError(f"line {decoded.line}: {decoded.problem}")
+        text = decoded.text.removeprefix("\ufeff")
+        root = xml_tree.parse(data) if text.lstrip(" \r\n").startswith("<") else None
+    if root is not None and root.tag == simatic_ml.ROOT:
+        return simatic_ml.read(root, name, further, encoding, type_bytes or {}, by_name=by_name)
+    if further or type_bytes or by_name:
+        raise ImportingError(
+            "further files, --type-bytes and --by-name are for data blocks in XML of TIA Portal Openness, not for this "
+            "file; leave them out"
+        )
+    if root is not None:
+        return _of_xml(root)
+    if data.startswith(b"PK"):
         return tia_workbook.read(data)
-    decoded = decode(data, encoding)
-    if decoded.fatal:
-        raise ImportingError(f"line {decoded.line}: {decoded.problem}")
-    text = decoded.text.removeprefix("\ufeff")
-    if text.lstrip(" \r\n").startswith("<"):
-        root = xml_tree.parse(data)
-        if root.tag in tia_tag_table.ROOTS:
-            return tia_tag_table.read(root)
-        if root.tag == node_set.ROOT:
-            return node_set.read(root)
-        if root.tag == simatic_ml.ROOT:
-            return simatic_ml.read(root, name, further, encoding, type_bytes or {}, by_name=by_name)
-        raise ImportingError(f"XML with the root {root.tag[:80]!r} is unknown; shmio-layout import reads: {FORMATS}")
     found_format = format_of(data, text)
+    if found_format is None and SOURCE.search(text):
+        raise ImportingError("this is the source of a data block, which needs no import; name it in the key layout")
     if found_format is None:
         raise ImportingError(f"the format is unknown; shmio-layout import reads: {FORMATS}")
     found = kepserver.read(text) if found_format is Format.KEPSERVER else step7_symbols.read(text)
     if decoded.problem:
         found.remarks.append(f"{name}:{decoded.line}:{decoded.column}: warning: {decoded.problem}")
     return found
+
+
+def _of_xml(root: xml_tree.Node) -> Found:
+    if root.tag in tia_tag_table.ROOTS:
+        return tia_tag_table.read(root)
+    if root.tag == node_set.ROOT:
+        return node_set.read(root)
+    raise ImportingError(f"XML with the root {root.tag[:80]!r} is unknown; shmio-layout import reads: {FORMATS}")

@@ -42,7 +42,10 @@ class _Model:
             "http://opcfoundation.org/UA/",
             *((u.text or "").strip() for u in root.iterfind("NamespaceUris/Uri")),
         ]
-        self.nodes = {node.get("NodeId", ""): node for node in root if node.get("NodeId")}
+        self.nodes: dict[str, Node] = {}
+        for node in root:
+            if node.get("NodeId"):
+                self.nodes.setdefault(node.get("NodeId", ""), node)
         self.parents: dict[str, str] = {}
         self.units: dict[str, str] = {}
         for key, node in self.nodes.items():
@@ -111,8 +114,11 @@ def read(root: Node) -> Found:
     if not model.nodes:
         raise ImportingError("expected nodes below UANodeSet, found none")
     found = Found("an OPC UA NodeSet2")
-    for key, node in model.nodes.items():
-        if node.tag == "UAVariable":
+    for node in root:
+        key = node.get("NodeId", "")
+        if node.tag == "UAVariable" and model.nodes.get(key) is not node:
+            found.skip(_name(node), "the file has its node id twice" if key else "the node has no id", node.line)
+        elif node.tag == "UAVariable":
             _add(found, model, key, node)
     return found
 

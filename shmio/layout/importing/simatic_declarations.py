@@ -11,7 +11,7 @@ from shmio.errors import Diagnostic
 from shmio.layout.importing.xml_tree import Node
 from shmio.layout.model import MAX_DEPTH, element_type
 from shmio.layout.report import Report
-from shmio.layout.source import parser
+from shmio.layout.source import parser, system_types
 from shmio.layout.source.syntax import (
     Array,
     Assignment,
@@ -97,8 +97,8 @@ class _Reader:
         number = attribute(node, "Number")
         body: Type = struct
         instance_of = attribute(node, "InstanceOfName")
-        if not struct.members and instance_of:
-            body = Named(instance_of, True, self.at(node))
+        if instance_of and (not struct.members or (system_types.is_known(instance_of) and not self._by_name)):
+            body = Named(instance_of, True, self.at(node))  # the file has only some members of a system type
         return BlockDeclaration(
             attribute(node, "Name"),
             int(number) if number.isdecimal() and len(number) <= 5 and 0 < int(number) <= _MAX_NUMBER else None,

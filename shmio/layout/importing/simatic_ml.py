@@ -58,6 +58,8 @@ def read(
             sources.append(Source(source.file, source.text, source.encoding or encoding))
     blocks = [(file, node) for file, one in roots.items() for tag in _BLOCKS for node in one.iter(tag)]
     tables = list(root.iter("SW.Tags.PlcTagTable"))
+    for node in root.iter("SW.Blocks.ArrayDB"):
+        found.skip(attribute(node, "Name"), "an ARRAY data block is not supported", node.line)
     if not tables and not blocks:
         others = ", ".join(sorted({child.tag for child in root if child.tag.startswith("SW.")})) or "nothing"
         raise ImportingError(f"expected a PLC tag table or a data block, found {others}")
@@ -100,12 +102,14 @@ def _add_blocks(
         single: Whether there is nothing but one block, so that paths need not begin with its name.
 
     """
+    unused = set(type_bytes)
     for _, node in blocks:
         name = attribute(node, "Name")
         try:
             compiled = named.compile((name,), type_bytes, by_name=True)
             [layout] = compiled.layouts
             warnings = [*compiled.warnings]
+            unused &= {*compiled.unused}
             addresses: Mapping[str, Register] = {}
             if placed is not None and not layout.optimized:
                 addresses, more = _placed(placed, name, type_bytes)
@@ -121,6 +125,7 @@ def _add_blocks(
         if not layout.optimized and placed is not None and layout.number is None:
             found.remarks.append(f"{name} has no number, so its members have no addresses")
         _add_block(found, layout, addresses, () if single else (name,), node.line)
+    found.remarks += [f"--type-bytes: no member has the type {name!r}" for name in sorted(unused)]
 
 
 def _placed(
@@ -143,8 +148,7 @@ def _add_block(
             f"{name} has optimized access: its values have no addresses, and the column is empty; read it by OPC UA "
             "with nodes = \"siemens\", or switch off 'Optimized block access'"
         )
-    if number is None:
-        addresses = {}
+    addresses = {path: at for path, at in addresses.items() if number is not None and path in layout.by_path}
     for register in layout.registers:
         at = addresses.get(register.path)
         names = prefix + tuple(map(decode_segment, register.path.split("/")))

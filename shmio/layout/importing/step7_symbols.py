@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from shmio.layout.foreign import COLUMNS, FIXED, HEADINGS, MAX_PROBED, OPERAND, is_header
+from shmio.layout.foreign import COLUMNS, FIXED, MAX_PROBED, OPERAND, headings, is_header
 from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.importing.plc_tag import CONSTANT, add_plc_tag
 from shmio.layout.rows import delimiter_of, rows
@@ -68,7 +68,7 @@ def _separated(found: Found, text: str) -> Iterator[tuple[int, dict[str, str]]]:
     first = next((line for line in text.split("\n") if line.strip()), "")
     table = list(rows(text, delimiter_of(first)))
     if table and is_header(table[0][1]):
-        columns: Sequence[str] = [HEADINGS.get(cell.lower(), "") for cell in table.pop(0)[1]]
+        columns: Sequence[str] = headings(table.pop(0)[1])
     else:
         counts = Counter(len(cells) for _, cells in table[:MAX_PROBED] if len(cells) in COLUMNS)
         if not counts:

@@ -14,11 +14,15 @@ _NEEDED: Final = ("name", "data type", "logical address")
 
 def read(data: bytes) -> Found:
     """Return the tags of the sheet ``PLC Tags``; raise ImportingError if there is no such sheet."""
+    found = Found("PLC tags of TIA Portal")
     try:
-        rows = read_rows(data, lambda names: SHEET if SHEET in names else None)
+        rows = read_rows(
+            data,
+            lambda names: SHEET if SHEET in names else None,
+            lambda error: found.skip("a row", str(error), error.row),
+        )
     except WorkbookError as error:
         raise ImportingError(f"{error}; expected an export of TIA Portal's PLC tags with the sheet {SHEET!r}") from None
-    found = Found("PLC tags of TIA Portal")
     header = {name.strip().lower(): place for place, name in enumerate(rows[0][1])} if rows else {}
     if missing := [name for name in _NEEDED if name not in header]:
         raise ImportingError(f"the sheet {SHEET!r} does not have the columns {', '.join(missing)}")

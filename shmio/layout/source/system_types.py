@@ -129,6 +129,11 @@ def _parsed(texts: Sequence[str]) -> Mapping[str, TypeDeclaration]:
     return {declaration.name.lower(): declaration for declaration in unit.types}
 
 
+def is_known(name: str) -> bool:
+    """Return whether the name is that of a system type."""
+    return bool(length(name) or refusal(name)) or name.lower() in declarations()
+
+
 def length(name: str) -> int:
     """Return the size in bytes of a type whose members are not public; 0 for any other type."""
     return _LENGTHS.get(name.upper(), 0)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import datetime
+import io
 import re
 from pathlib import Path
 
+import openpyxl
 import pytest
 
 from shmio.cli.layout import main
@@ -508,3 +511,60 @@ def test_the_command_names_every_row_it_left_out(capsys: pytest.CaptureFixture[s
     assert main(["import", str(tmp_path / "k.csv")]) == 0
     report = capsys.readouterr().err
     assert all(f"r{n} (line {n + 2})" in report for n in range(40))
+
+
+def test_what_an_importer_leaves_out_has_its_line() -> None:
+    book = openpyxl.Workbook()
+    page = book.active
+    assert page is not None
+    page.title = "PLC Tags"
+    for row in (
+        ["Name", "Data Type", "Logical Address", "Comment"], ["a", "Bool", "%M0.0", "x"],
+        ["b", "Bool", "%M0.1", datetime.date(2024, 1, 1)], [None, "Bool", "%M0.2", ""], ["d", '"T"', "%M2.0", ""],
+    ):  # fmt: skip
+        page.append(row)
+    book.save(buffer := io.BytesIO())
+    found = import_tags(buffer.getvalue())
+    assert (list(found.tags), left_out(found)) == (["a"], {"a row": 4, "d": 5})
+    assert "cell D3 is a date or a time" in next(iter(found.skipped))
+    nodes = (
+        '<UANodeSet>\n<UAVariable NodeId="i=1" BrowseName="a" DataType="i=1"/>\n<UAVariable BrowseName="b"/>\n'
+        '<UAVariable NodeId="i=1" BrowseName="c" DataType="i=1"/>\n'
+        '<UAVariable NodeId="i=2" BrowseName="d" DataType="i=1" ValueRank="2" ArrayDimensions="3"/></UANodeSet>'
+    )
+    found = import_tags(nodes.encode())
+    assert (list(found.tags), left_out(found)) == (["a"], {"b": 3, "c": 4, "d": 5})
+    table = (
+        "<Tagtables><Tagtable><Tag type='Bool' addr=''>a</Tag>\n<Tag type='Bool' addr='%M0.0'>b</Tag>\n"
+        "<Foo>c</Foo></Tagtable></Tagtables>"
+    )
+    found = import_tags(table.encode())
+    assert (list(found.tags), left_out(found)) == (["b"], {"a": 1, "c": 3})
+    both = ml("", "ArrayDB").removesuffix("</Document>") + ml('<Member Name="a" Datatype="Int"/>')[10:]
+    found = import_tags(both.encode())
+    assert (list(found.tags), left_out(found)) == (["a"], {"B": 1})
+
+
+def test_an_instance_of_a_system_type_has_no_addresses() -> None:
+    members = "".join(f'<Member Name="{name}" Datatype="{kind}"/>' for name, kind in (("PT", "Time"), ("Q", "Bool")))
+    more = "<Number>7</Number><InstanceOfName>IEC_TIMER</InstanceOfName>"
+    found = import_tags(ml(members, "InstanceDB", more).encode())
+    assert places(found) == {"PT": ("TIME", ""), "Q": ("BOOL", "")}
+
+
+def test_options_that_do_not_suit_a_list_are_refused() -> None:
+    with pytest.raises(ImportingError, match="data blocks in XML of TIA Portal Openness"):
+        imported("s7/kep_s7.csv", "s7/ml_udt_type.xml")
+    for options in ({"type_bytes": {"T": 2}}, {"by_name": True}):
+        with pytest.raises(ImportingError, match="data blocks in XML of TIA Portal Openness"):
+            imported("s7/kep_s7.csv", **options)
+    assert "'Nope'" in imported("s7/ml_dtl.xml", type_bytes={"Nope": 2}).remarks[0]
+    with pytest.raises(ImportingError, match="needs no import"):
+        imported("s7/simatic_sd.s7dcl")
+
+
+def test_files_beside_sources_of_simatic_sd_are_named() -> None:
+    with pytest.raises(LayoutError, match=r"texts of a source in SIMATIC SD \(\.s7res\)"):
+        compile_sources([Source("a.s7res", b"MultiLingualTexts:\n  - id: MLC_a\n    en-US: text\n")])
+    header = b"(*\nV1 initial version\n*)\nDATA_BLOCK DB1 STRUCT a : Int; END_STRUCT BEGIN END_DATA_BLOCK"
+    assert compile_sources([Source("a.awl", header)]).layouts[0].registers[0].path == "a"
