@@ -34,6 +34,13 @@ def clear(path: str) -> None:
         ) from None
 
 
+def remove_left(path: str) -> None:
+    """Remove a socket file at which no process listens, if there is one and this user may remove it."""
+    with suppress(OSError):
+        if stat.S_ISSOCK(os.lstat(path).st_mode) and not listened_on(path):
+            Path(path).unlink()
+
+
 def obstacle(path: str) -> str | None:
     """Return why processes of this user cannot listen at a path; None if they can."""
     folder = Path(path).parent

@@ -11,7 +11,9 @@ import msgspec
 
 from shmio.audit.file import AuditSettings
 from shmio.config import Config, Mqtt, Source
+from shmio.config.address import UNIX, UnixAddress
 from shmio.config.model import Fabric
+from shmio.config.unix_socket import remove_left
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access
 from shmio.layout.model import Layout
@@ -126,6 +128,12 @@ class Job:
         listen = self.config.get("listen") or ()
         texts = [listen] if isinstance(listen, str) else [*listen]
         return [*texts, *(address["listen"] for address in self.config.get("address", ()))]
+
+    def remove_sockets(self) -> None:
+        """Remove the UNIX sockets of the process, which has ended: if it was killed, their files are left."""
+        for text in self.listening:
+            if text.startswith(UNIX):
+                remove_left(UnixAddress.parse(text).path)
 
     def describe(self, instance: str, epoch: int) -> bytes:
         """Return the description of this job, a JSON object that the process reads from its standard input."""

@@ -137,6 +137,8 @@ class Supervisor:
                 known = last_events(Path(self._plan.audit.path), began) if found else {}
                 stack.callback(LocalCommands(self._plan.instance, known).close)
             self._loop()
+            for job in self._reloader.plan.jobs:
+                job.remove_sockets()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
             self._segment.unlink()  # before answering: the client may start it again at once
@@ -187,10 +189,14 @@ class Supervisor:
         self._reloader.drop()
 
     def _hasten(self) -> None:
-        """Kill the processes that have not stopped yet, after a second request to stop."""
+        """Kill the processes that have not stopped yet, after a second request to stop.
+
+        Whoever is in a hurry may kill the supervisor next, so remove the segment's name at once.
+        """
         log.warning("the supervisor is killing the processes that have not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
+        self._segment.unlink()
 
     def _handle(self, request: Request, answer: Answer) -> None:
         if not (isinstance(request, Where) or (isinstance(request, Reload) and request.dry_run)):

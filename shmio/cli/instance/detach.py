@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.common import say
+from shmio.cli.common import exit_on_signals, say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ConfigError, ControlError
 from shmio.local.status import InstanceStatus, SourceStatus, problems, read_status
@@ -66,7 +66,8 @@ StartMessage = Configured | Started | Failed
 def detach(arguments: argparse.Namespace) -> int:
     """Start the instance in another process, and return once it runs."""
     file, mode = config_file(arguments), arguments.mode
-    log_file, started = start(file, mode, replay_words(replay_keys(arguments)))
+    with exit_on_signals():  # so that no instance goes on that nobody waits for
+        log_file, started = start(file, mode, replay_words(replay_keys(arguments)))
     for line in started.history:
         say(line)
     status = read_status(started.instance)

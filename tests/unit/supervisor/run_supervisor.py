@@ -30,6 +30,9 @@ LAYOUTS = {
 }
 
 
+listening = {"listen": (folder / "listen").read_text()} if (folder / "listen").exists() else {}
+
+
 def block(name: str, layout: Layout, ring_bytes: int) -> BlockSpec:
     return BlockSpec(name, layout, 20_000_000, 500_000_000, ring_bytes)
 
@@ -51,7 +54,7 @@ def make(settings: dict[str, Any]) -> Plan:
             if kind == "source"
         ),
         jobs=tuple(
-            Job(name, kind, folder / f"{name}.log", {"behaviour": behaviour, "ends": str(folder / "ends")})
+            Job(name, kind, folder / f"{name}.log", {"behaviour": behaviour, "ends": str(folder / "ends"), **listening})
             for name, kind, behaviour, *_ in settings["jobs"]
         ),
         warnings=tuple(settings.get("warnings", ())),

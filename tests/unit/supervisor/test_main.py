@@ -92,6 +92,32 @@ def test_a_second_stop_signal_skips_the_grace_time(launch: Launch) -> None:
     assert cell.of("plc").state == "running", "it is stopped later"
     cell.process.send_signal(signal.SIGINT)
     assert cell.wait_end() == 0
+    assert cell.instance not in instances()
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGTERM, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)])
+@pytest.mark.parametrize("state", ["starting", "running"])
+def test_two_signals_at_once_leave_nothing(
+    launch: Launch, tmp_path: Path, runtime: Path, state: str, signals: tuple[signal.Signals, ...]
+) -> None:
+    left = tmp_path / "left.sock"
+    with socket.socket(socket.AF_UNIX) as listener:  # of an endpoint that was killed
+        listener.bind(str(left))
+    jobs = [("plc", "emulator", ["good"]), ("grpc", "grpc", ["never" if state == "starting" else "good"])]
+    (tmp_path / "listen").write_text(f"unix:{left}")
+    cell = launch(jobs, start_s=3600)
+    if state == "running":
+        cell.wait_state("running")
+    else:
+        until(lambda: cell.instance in instances() and cell.of("grpc").pid is not None)
+    pids = [pid for pid in cell.pids().values() if pid is not None]
+    for number in signals:
+        cell.process.send_signal(number)
+    assert cell.wait_end() == 0
+    assert cell.instance not in instances()
+    assert not left.exists()
+    assert not [file for file in runtime.rglob("*") if file.is_socket()]
+    assert not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
 def test_a_refused_configuration_fails_the_start(launch: Launch, tmp_path: Path) -> None:

@@ -124,3 +124,16 @@ def test_a_take_over_fails_if_a_hanging_process_cannot_be_ended(launch: Launch) 
     successor.wait_state("running")
     assert {name for name, pid in successor.pids().items() if pid == before[name]} == {"plc", "grpc"}
     assert successor.stop() == 0
+
+
+def test_a_hurried_end_removes_the_segment_before_all_processes_have_ended(launch: Launch) -> None:
+    cell, pid, _ = held(launch, "cell")
+    cell.process.send_signal(signal.SIGTERM)
+    cell.wait_state("stopping")
+    cell.process.send_signal(signal.SIGINT)
+    until(lambda: cell.instance not in instances())
+    os.kill(pid, 0)
+    cell.process.kill()  # as what ends a container does
+    cell.wait_end()
+    assert cell.instance not in instances()
+    os.kill(pid, signal.SIGKILL)
