@@ -268,7 +268,7 @@ def test_secrets_are_left_out_and_asked_for(tmp_path: Path) -> None:
     (tmp_path / "keyed.py").write_text(KEYED)
     (tmp_path / "other" / "tags.toml").write_text('[registers]\npassword = "INT"\n')
     (tmp_path / "supervisor.toml").write_text('[instance]\nname = "keyed"\n' + source + ENDPOINTS)
-    command = [BIN / "shmio-supervisor", "export-fmu", "-o", "cell.fmu"]
+    command: list[str | Path] = [BIN / "shmio-supervisor", "export-fmu", "-o", "cell.fmu"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stderr.splitlines() == [
         "left out, because they may have secrets: headers.ini, token.csv, other/own.json, other/supervisor.toml",
