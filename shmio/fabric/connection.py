@@ -431,8 +431,8 @@ def refusal(access: Access, text: str, cell: object = None) -> str:
         return f"{who} may not {_refused_request(subject.lower())}{more}"
     if parts[0] == "shmio" and len(parts) > 5:
         own = parts[6:9] if parts[5] == "command" and found["verb"] == "publish" else parts[1:4]
-    elif parts[0].lower() == "$kv" and len(parts) == 5:
-        own = parts[2:5]
+    elif parts[0].lower() == "$kv":
+        own = parts[2:5] if len(parts) == 5 else ["a cell"]  # a layout, not an entry
     else:
         return f"{who} may not {'publish to' if found['verb'] == 'publish' else 'subscribe to'} {subject}"
     more = "; if an instance runs the server, name the cell in its [[fabric.allow]]" if unknown else ""

@@ -18,6 +18,7 @@ import msgspec
 
 from shmio.errors import ConfigError, RemoteError
 from shmio.fabric.connection import FARM, INSTALL, RETRY_S, Access, RefusedError, call_once
+from shmio.fabric.registry import ELECTION, is_away
 from shmio.libraries import library
 from shmio.wording import counted
 
@@ -164,7 +165,9 @@ async def contact(client: Client) -> None:
         if not await open_queue(client):
             for name in (NAME, f"OBJ_{NAME}"):
                 await _replicate(client, name)
-    except js.ServiceUnavailableError:
+    except js.ServiceUnavailableError as error:
+        if is_away(error):
+            raise RemoteError(f"the NATS servers do not answer about the stream {NAME}; {ELECTION}") from None
         raise RemoteError(
             "the NATS server has no JetStream; start it with -js, or set jetstream in its configuration"
         ) from None

@@ -12,7 +12,7 @@ from nats.errors import Error
 from shmio.config.model import MqttTls
 from shmio.errors import RemoteError
 from shmio.fabric.client import FabricClient
-from shmio.fabric.connection import Access, connect, connect_or_stop
+from shmio.fabric.connection import Access, connect, connect_or_stop, refusal
 from shmio.fabric.tasks import end
 from shmio.testing.ports import reserved_port
 
@@ -129,6 +129,25 @@ def test_a_server_that_is_too_old_is_refused(version: str, works: bool) -> None:
         await server.wait_closed()
 
     asyncio.run(work())
+
+
+def test_what_a_server_refuses_is_said_with_the_remedy() -> None:
+    own, seed = Access(("nats://a",)), Access(("nats://a",), credentials="x.seed")
+    allow = "if an instance runs the server, name the cell in its [[fabric.allow]]"
+    for access, subject, words in (
+        (own, "$KV.shmio_layouts.ab12", f"this user may not publish as p.l.c; use the seed of this cell; {allow}"),
+        (own, "$KV.shmio_cells.p.l.c", f"this user may not publish as p.l.c; use the seed of this cell; {allow}"),
+        (own, "shmio.p.l.c.s.live", f"this user may not publish as p.l.c; use the seed of this cell; {allow}"),
+        (
+            seed,
+            "$KV.shmio_layouts.ab12",
+            "the user of the credentials in x.seed may not publish as p.l.c; use the seed",
+        ),
+        (own, "$JS.API.STREAM.CREATE.shmio~p~l~c", "may not create histories; use admin.seed"),
+        (own, "$JS.API.CONSUMER.CREATE.shmio~p~l~c", "if an instance runs the server, be its user on its host"),
+    ):
+        said = f'nats: permissions violation for publish to "{subject.lower()}"'
+        assert words in refusal(access, said, "p.l.c"), subject
 
 
 @pytest.mark.parametrize("connects", [True, False])
