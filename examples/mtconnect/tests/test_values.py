@@ -6,7 +6,7 @@ import pytest
 
 from shmio.connectors.register_image import RegisterImage
 from shmio.layout.tags import place_tags
-from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, UNCERTAIN, StatusArea
+from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, UNCERTAIN, UNREADABLE_TIME, StatusArea
 from shmio_mtconnect.documents import DataItem, Observation
 from shmio_mtconnect.values import Target, parse
 
@@ -42,7 +42,7 @@ def test_doubtful_values_are_uncertain(caplog: pytest.LogCaptureFixture) -> None
         "VALUE", position(1, "1"), position(2, "2", at_ns=0), position(3, "3", at_ns=0), position(4, "4"),
         position(5, "5", quality="UNVERIFIABLE"), position(6, "6", quality="INVALID"), type_="LREAL",
     )  # fmt: skip
-    assert found == [GOOD, UNCERTAIN, UNCERTAIN, GOOD, UNCERTAIN, UNCERTAIN]
+    assert found == [GOOD, UNREADABLE_TIME, UNREADABLE_TIME, GOOD, UNCERTAIN, UNCERTAIN]
     assert [record.getMessage() for record in caplog.records] == [
         "pos: its timestamp cannot be read, so its value is uncertain",
         "pos: the agent reports the quality UNVERIFIABLE, so its value is uncertain",

@@ -22,6 +22,18 @@ class Choice(NamedTuple):
 Steps = tuple[str | int | Choice, ...]
 """Names of members, indices of elements and choices of objects, from the whole document to the value."""
 
+
+class Companion(NamedTuple):
+    """The path of something that belongs to a value, such as its time: from the whole document, or beside the value."""
+
+    beside: bool
+    steps: Steps
+
+    def of(self, value: Steps) -> Steps:
+        """Return the path for a value with the path ``value``."""
+        return (*value[:-1], *self.steps) if self.beside else self.steps
+
+
 MAX_STEPS: Final = 16
 _STEP: Final = re.compile(
     r"""\.(?P<name>[^.\[\]'"]+)|\[(?P<index>[0-9]{1,6})\]|\['(?P<single>[^']+)'\]|\["(?P<double>[^"]+)"\]"""
@@ -60,6 +72,18 @@ def parse(text: str) -> Steps:
     if steps and isinstance(steps[-1], Choice):
         raise ValueError(f"{text[:60]!r}: a selected object is no value; append a member, such as .v")
     return tuple(steps)
+
+
+def parse_companion(text: str) -> Companion:
+    """Parse the path of something that belongs to a value: ``$.time``, or ``@.time`` beside the value.
+
+    Raises:
+        ValueError: The path is wrong; the message says what is wrong.
+
+    """
+    if text[:1] not in ("$", "@"):
+        raise ValueError(f"{text!r} is not a path; write, for example, $.timestamp, or @.timestamp beside the value")
+    return Companion(text[0] == "@", parse(text))
 
 
 class Document:

@@ -62,7 +62,10 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     """
     will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
     time: _Text | None = None
-    """Path of the source time in JSON payloads. None: the source time is the time of receipt."""
+    """Path of the source time in JSON payloads; ``@`` is the object that contains the value. None: the time of receipt.
+    """
+    quality: _Text | None = None
+    """Path of the quality of values in JSON payloads. None: values are good."""
     texts: tuple[_Text, _Text] = ("false", "true")
     """The texts published for a BOOL register: the first for false, the second for true."""
     templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)

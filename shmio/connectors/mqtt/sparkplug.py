@@ -20,19 +20,16 @@ from shmio.backoff import Backoff
 from shmio.connectors.mqtt import metric
 from shmio.connectors.mqtt.address import NAMESPACE, Metric
 from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.connectors.mqtt.quality import from_number
 from shmio.connectors.mqtt.topic import Found, Message, Origin
 from shmio.model.statuses import (
     BAD_NO_COMMUNICATION,
     BAD_NOT_FOUND,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    UNCERTAIN_LAST_USABLE_VALUE,
     UNREADABLE_TIME,
-    from_opc_quality,
-    unknown_quality,
 )
 from shmio.wire import sparkplug_b_pb2 as wire
-from shmio.wording import brief
 
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 100_000
@@ -45,7 +42,6 @@ CALM_NS: Final = 120_000_000_000
 """The waiting times start again with the shortest if shmio has not asked the node for this time in ns."""
 KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
 _SEQUENCE: Final = 256
-_STALE: Final = 500
 _MAX_MS: Final = ((1 << 63) - 1) // 1_000_000
 
 log = logging.getLogger("shmio.source.mqtt")
@@ -498,9 +494,5 @@ def _quality(one: wire.Metric) -> tuple[int, str]:
             if found is not None and field in ("int_value", "long_value"):
                 bits = 32 if field == "int_value" else 64
                 found -= (found >> bits - 1) << bits
-            if isinstance(found, int | float) and not isinstance(found, bool):
-                code = UNCERTAIN_LAST_USABLE_VALUE if found == _STALE else from_opc_quality(found)
-                if code is not None:
-                    return code, ""
-            return unknown_quality(found), f"its quality is {brief(found)}, which has no meaning that shmio knows"
+            return from_number(found)
     return GOOD, ""

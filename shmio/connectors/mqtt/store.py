@@ -11,7 +11,7 @@ from typing import Any, Final
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.address import NAMESPACE, Address, Metric, Place, parse
 from shmio.connectors.mqtt.faults import ValueFaultError
-from shmio.connectors.mqtt.json_path import Steps
+from shmio.connectors.mqtt.json_path import Companion
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.sparkplug import Device, Host
 from shmio.connectors.mqtt.topic import Found, Message, Origin, Topic
@@ -109,7 +109,8 @@ class Store:
         self._expiry_ns = 0
         """No message becomes too old before this time of CLOCK_MONOTONIC, in ns."""
         self._group_of: list[Group] = []
-        self._ages, self._time = _Ages(options), _time_path(options)
+        self._ages = _Ages(options)
+        self._time, self._quality = _companion("time", options.time), _companion("quality", options.quality)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._codes = [GOOD] * len(layout.registers)
         self._order = 0  # continues from one connection to the next
@@ -154,7 +155,7 @@ class Store:
         source = address.source
         if isinstance(source, Metric):
             return self.host.origin(source, index)
-        new = Topic(source.topic, self._time, self._options.max_payload_bytes)
+        new = Topic(source.topic, self._time, self._quality, self._options.max_payload_bytes)
         topic = self._topics.setdefault(source.topic, new)
         topic.place(index, source.steps)
         return topic
@@ -437,15 +438,11 @@ class _Ages:
         return 0
 
 
-def _time_path(options: MqttOptions) -> Steps | None:
-    if options.time is None:
-        return None
+def _companion(key: str, text: str | None) -> Companion | None:
     try:
-        if not options.time.startswith("$"):
-            raise ValueError(f"{options.time!r} is not a path; write, for example, $.timestamp")
-        return json_path.parse(options.time)
+        return None if text is None else json_path.parse_companion(text)
     except ValueError as error:
-        raise ConfigError(f"time: {error}") from None
+        raise ConfigError(f"{key}: {error}") from None
 
 
 def _check_templates(options: MqttOptions, addresses: Sequence[Address]) -> None:

@@ -12,13 +12,15 @@ import msgspec
 
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.faults import ValueFaultError
-from shmio.connectors.mqtt.json_path import AbsentError, Choice, Document, Steps
+from shmio.connectors.mqtt.json_path import AbsentError, Choice, Companion, Document, Steps
+from shmio.connectors.mqtt.quality import from_json
 from shmio.connectors.mqtt.values import decode_json
 from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_USER_ACCESS_DENIED,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
+    UNCERTAIN,
     UNREADABLE_TIME,
 )
 from shmio.wording import brief
@@ -98,12 +100,13 @@ class Origin(ABC):
 class Topic(Origin):
     """A topic whose payloads are text or JSON."""
 
-    def __init__(self, name: str, time: Steps | None, max_bytes: int) -> None:
+    def __init__(self, name: str, time: Companion | None, quality: Companion | None, max_bytes: int) -> None:
         """Create the topic.
 
         Args:
             name: The topic's name.
             time: The path of the source time in JSON. If None, the source time is the time of receipt.
+            quality: The path of the quality in JSON. If None, values are good.
             max_bytes: The size of the largest payload that is read.
 
         """
@@ -116,7 +119,7 @@ class Topic(Origin):
         """True if this source has published a message on the topic that the broker did not retain."""
         self._seen: bytes | None = None
         """The payload of the last message on the connection before; None if there was none."""
-        self._time, self._max_bytes = time, max_bytes
+        self._time, self._quality, self._max_bytes = time, quality, max_bytes
         self._document: Document | ValueFaultError | None = None
         self._decoded: Message | None = None
         self._choosing: list[int] = []
@@ -185,8 +188,11 @@ class Topic(Origin):
             return Found(message.payload, message.utc_ns, text=True)
         document = self._json(message)
         found = json_path.extract(document, steps)
-        source_ns = None if self._time is None else self._source_ns(document, self._time)
-        return Found(found, source_ns or message.utc_ns, UNREADABLE_TIME if source_ns == 0 else GOOD)
+        source_ns = None if self._time is None else self._source_ns(document, self._time.of(steps))
+        code, reason = (GOOD, "") if self._quality is None else _quality(document, self._quality.of(steps))
+        if code == GOOD and source_ns == 0:
+            code = UNREADABLE_TIME
+        return Found(found, source_ns or message.utc_ns, code, reason=reason)
 
     def _json(self, message: Message) -> Document:
         if self._decoded is not message:
@@ -231,6 +237,14 @@ class Topic(Origin):
         if self.message is not None:
             self.take(self.message)
         self._chosen |= {index: known[self.places[index]] for index in self._choosing if self.places[index] in known}
+
+
+def _quality(document: Document, path: Steps) -> tuple[int, str]:
+    """Return the status that a document states, and what the status does not say."""
+    try:
+        return from_json(json_path.extract(document, path))
+    except ValueFaultError as error:
+        return UNCERTAIN, f"it has no quality ({error})"
 
 
 def time_ns(found: Any) -> int:

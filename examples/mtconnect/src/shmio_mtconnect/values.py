@@ -21,6 +21,7 @@ from shmio.model.statuses import (
     BAD_TYPE_MISMATCH,
     GOOD,
     UNCERTAIN,
+    UNREADABLE_TIME,
 )
 from shmio_mtconnect.documents import DataItem, Observation
 
@@ -162,7 +163,8 @@ class Target:
             image.fail(self._index, BAD_OUT_OF_RANGE, observation.source_ns)
         else:
             doubt = observation.doubt
-            image.put(self._index, value, observation.source_ns, UNCERTAIN if doubt else GOOD)
+            code = UNREADABLE_TIME if not observation.source_ns else UNCERTAIN if doubt else GOOD
+            image.put(self._index, value, observation.source_ns, code)
             if doubt and not self._doubted:
                 log.warning("%s: %s, so its value is uncertain", self._register.path, doubt)
             self._doubted = bool(doubt)

@@ -15,15 +15,18 @@ from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.layout.values.codec import Value, codec
 from shmio.model.statuses import (
+    BAD,
     BAD_INDEX_RANGE_NO_DATA,
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
+    UNCERTAIN,
     UNREADABLE_TIME,
     RegisterStatus,
     StatusArea,
     describe,
+    unknown_quality,
 )
 from shmio.wire import sparkplug_b_pb2 as wire
 from tests.unit.connectors.source import layout_of
@@ -117,6 +120,24 @@ def test_a_list_that_contains_only_what_has_changed() -> None:
     after.store.inherit(broker.store)
     assert [after.status(name).quality.name for name in "abcd"] == ["BAD", "GOOD", "GOOD", "BAD"]
     assert [after.value(name) for name in "bc"] == [3, 5]
+
+
+def test_a_quality_and_a_time_beside_each_value(caplog: pytest.LogCaptureFixture) -> None:
+    """As Kepware's IoT gateway sends them."""
+    tags: dict[str, Any] = {name: ("INT", f"kep $.values[id=Line.{name}].v") for name in "abc"}
+    broker = Broker(tags | {"whole": ("INT", "n $")}, time="@.t", quality="@.q")
+    for quality, code in (
+        (True, GOOD), (False, BAD), (192, GOOD), (24, 0x80310000), ("Good", GOOD), ("bad", BAD), ("odd", UNCERTAIN),
+        (None, UNCERTAIN), (512, unknown_quality(512)),
+    ):  # fmt: skip
+        values = [{"id": "Line.a", "v": 1, "q": quality, "t": SECOND}, {"id": "Line.b", "v": 2, "q": True, "t": 0}]
+        broker.publish("kep", {"timestamp": 5, "values": [*values, {"id": "Line.c", "v": 3, "t": SECOND + 1}]})
+        assert broker.status("a") == (code, SECOND * 10**9), quality
+        assert (broker.status("b").code, broker.status("c")) == (UNREADABLE_TIME, (UNCERTAIN, (SECOND + 1) * 10**9))
+        assert [broker.value(name) for name in "abc"] == [1, 2, 3]
+    assert "c: it has no quality (the JSON has no member 'q')" in caplog.text
+    broker.publish("n", 7)
+    assert (broker.value("whole"), broker.status("whole").code) == (7, UNCERTAIN)
 
 
 def metric(value: int | float, alias: int, name: str = "", datatype: int = 2, quality: Any = None) -> wire.Metric:
