@@ -147,6 +147,37 @@ def test_all_areas_are_read_and_written(serve: Callable[[Plc], contextlib.Abstra
     assert plc.areas[SrvArea.MK][20:22] == (-40).to_bytes(2, "big", signed=True)
 
 
+@pytest.mark.parametrize("serve", [served, served_by_snap7])
+def test_texts_have_the_encoding_of_the_controller(
+    serve: Callable[[Plc], contextlib.AbstractContextManager[int]],
+) -> None:
+    plc = Plc()
+    tags: dict[str, object] = {
+        "text": {"type": "STRING[6]", "address": "DB1.DBB10"},
+        "char": {"type": "CHAR", "address": "DB1.DBB30"},
+        "list": {"type": "ARRAY[0..1] OF STRING[4]", "address": "DB1.DBB40"},
+    }
+    for encoding, data, text in [
+        ("windows-1252", bytes.fromhex("80 81 8d 8f 90 9d"), "€\x81\x8d\x8f\x90\x9d"),
+        ("gbk", bytes.fromhex("ce c2 b6 c8 81 20"), "温度\uf781 "),
+        ("cp949", bytes.fromhex("bf c2 b5 b5 ff"), "온도\uf7ff"),
+    ]:
+        plc.blocks[1][10 : 12 + len(data)] = bytes((6, len(data))) + data
+        plc.blocks[1][30] = 0x81
+        plc.blocks[1][40:52] = bytes((4, 4)) + data[:4] + bytes((4, 1)) + data[:1] + bytes(3)
+        before = bytes(plc.blocks[1])
+        layout = table(tags).with_encoding(encoding)
+        with serve(plc) as port, connected(layout, port) as connector:
+            found = values(layout, connector.read())
+            assert found["text"] == text, encoding
+            for path, value in found.items():
+                assert write(connector, layout, path, value) == [""], (encoding, path)
+            assert plc.blocks[1] == before
+            assert write(connector, layout, "text", text[0] + "1") == [""]
+            assert plc.blocks[1][10:14] == bytes((6, 2)) + data[:1] + b"1" or encoding != "windows-1252"
+            assert values(layout, connector.read())["text"] == text[0] + "1"
+
+
 def test_a_bit_is_written_without_its_neighbours() -> None:
     layout, plc = table(TAGS), Plc()
     plc.blocks[1][0] = 0xFF
