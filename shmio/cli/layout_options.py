@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from shmio.layout.compiler import Source
-from shmio.layout.encodings import codec
+from shmio.layout.encodings import codec, encoding_of_file
 from shmio.layout.model import MAX_BLOCK_BYTES
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 
@@ -18,8 +18,8 @@ def add_encoding(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         type=_encoding,
         default=None,
-        help="the encoding of texts without byte order mark, such as gbk or windows-1252; default: UTF-8, or else "
-        "Windows-1252 with a warning",
+        help="the encoding of texts in the controller, and in files that are not UTF-8, such as gbk; default: "
+        "Windows-1252, for files with a warning",
     )
 
 
@@ -38,7 +38,8 @@ def add_type_bytes(parser: argparse.ArgumentParser) -> None:
 def read_source(name: str, encoding: str | None, limit: int = MAX_SOURCE_BYTES) -> Source:
     """Read a file. If it is too large, read just enough that the compiler refuses it."""
     with Path(name).open("rb") as file:
-        return Source(name, file.read(limit + 4), encoding or "")
+        data = file.read(limit + 4)
+    return Source(name, data, encoding_of_file(data, encoding or ""))
 
 
 def _encoding(text: str) -> str:

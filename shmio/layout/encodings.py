@@ -87,6 +87,18 @@ def codec(name: str) -> str:
     return (_SINGLE | _MULTI)[canonical(name)]
 
 
+def encoding_of_file(data: bytes, given: str) -> str:
+    """Return the encoding of a source file whose controller has the encoding ``given``; "" if it is UTF-8.
+
+    Many people keep exports in UTF-8, whatever the controller has.
+    """
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return given
+    return ""
+
+
 class TextEncoding(ABC):
     """An encoding whose texts come back from their bytes, and whose bytes from their texts.
 

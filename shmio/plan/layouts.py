@@ -12,7 +12,7 @@ from pathlib import Path
 from shmio.config import Config, Emulator, Source
 from shmio.errors import ConfigError, Diagnostic, LayoutError, ValueRangeError
 from shmio.layout import compiler
-from shmio.layout.encodings import ISO_8859_1, WINDOWS_1252, canonical
+from shmio.layout.encodings import ISO_8859_1, WINDOWS_1252, canonical, encoding_of_file
 from shmio.layout.model import Layout, is_encoded
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.layout.values.literal import parse_literal
@@ -190,16 +190,7 @@ def _read(path: Path, key: str, encoding: str) -> compiler.Source:
             data = file.read(MAX_SOURCE_BYTES + 4)
     except OSError as error:
         raise ConfigError(f"{key}{path}: {error.strerror}") from None
-    return compiler.Source(str(path), data, "" if _is_utf8(data) else encoding)
-
-
-def _is_utf8(data: bytes) -> bool:
-    """Return whether bytes are text in UTF-8: many keep exports as UTF-8, whatever the controller has."""
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
+    return compiler.Source(str(path), data, encoding_of_file(data, encoding))
 
 
 def _open_at_once(path: str, flags: int) -> int:
