@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 CLOSE_S: Final = 0.2
+MAX_EXCESS: Final = 4
+"""A message that is larger than the limit by more than this factor ends the connection; a smaller one is dropped."""
+_HEAD_BYTES: Final = 2000
 MAX_REPORTED: Final = 20
 _SEND_TIMEOUT: Final = struct.Struct("@ll")
 
@@ -76,7 +79,7 @@ class Link:
             url: The server's URL.
             peer: The server's host and port.
             timeout_s: Time-out for connecting, and for each answer of the server.
-            max_bytes: The largest message that is accepted.
+            max_bytes: The largest message that is read. A larger one counts as a message that cannot be read.
             topics: The topics whose messages are kept.
 
         Raises:
@@ -89,6 +92,7 @@ class Link:
         from shmio.connectors.ros.connection import Connection  # noqa: PLC0415
 
         self._peer, self._timeout_s, self._topics = peer, timeout_s, topics
+        self._max_bytes = max_bytes
         self._closed_errors = (WebSocketException, OSError)
         self._stack = contextlib.ExitStack()
         self._condition = threading.Condition()
@@ -115,7 +119,7 @@ class Link:
             channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
             connection: Any = functools.partial(Connection, handle=self._take, end=self._end)
             self._socket: ClientConnection = connect(
-                url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=max_bytes,
+                url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=MAX_EXCESS * max_bytes,
                 ping_interval=None, compression=None, proxy=None, user_agent_header="shmio",
                 create_connection=connection,
             )  # fmt: skip
@@ -276,7 +280,11 @@ class Link:
             self._condition.notify_all()
 
     def _take(self, text: bytes) -> None:
-        envelope = _read(text)
+        if len(text) > self._max_bytes:
+            envelope = _unreadable(text[:_HEAD_BYTES])
+            self._report(f"sent a message of {len(text)} bytes; raise max_message_bytes to read it")
+        else:
+            envelope = _read(text)
         if envelope is None:
             raise ConnectorError("sent a message that is not of the rosbridge protocol")
         self.heard_ns = time.monotonic_ns()
@@ -313,9 +321,14 @@ class Link:
                 )
                 self._condition.notify_all()
                 return
+        if envelope.level in ("error", "warning"):
+            self._report(f"reports: {text}")
+
+    def _report(self, what: str) -> None:
+        """Log what the server does, but only ``MAX_REPORTED`` times in a connection."""
         self._reported += 1
-        if envelope.level in ("error", "warning") and self._reported <= MAX_REPORTED:
-            log.warning("%s reports: %s", self._peer, text)
+        if self._reported <= MAX_REPORTED:
+            log.warning("%s %s", self._peer, what)
 
 
 def decode(text: msgspec.Raw) -> Any:
@@ -339,6 +352,11 @@ def _read(text: bytes) -> _Envelope | None:
             for name in {"msg", "values"} & fields.keys():
                 fields[name] = msgspec.Raw(json.dumps(fields[name]).encode())
             return msgspec.convert(fields, _Envelope)
+    return _unreadable(text)
+
+
+def _unreadable(text: bytes) -> _Envelope | None:
+    """Return an empty message of the topic that a text names; None if it names none."""
     with contextlib.suppress(*_UNREADABLE):
         if found := _TOPIC.search(text):
             return _Envelope("publish", json.loads(found[1]))

@@ -144,6 +144,20 @@ def test_a_message_that_cannot_be_read_is_bad_alone(bridge: Bridge) -> None:
             assert source.code("other") == 0, message
 
 
+def test_a_message_that_is_too_large_is_bad_alone(bridge: Bridge, caplog: pytest.LogCaptureFixture) -> None:
+    tags = JOINTS | {"other": ("DINT", "/other std_msgs/Int32 data")}
+    with connected(bridge.url, tags, max_message_bytes=1000) as source:
+        bridge.ask("publish", "/other", {"data": 7})
+        bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0]))
+        source.until(lambda: source.code("j1") == 0 == source.code("other"))
+        bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0] * 500))
+        source.until(lambda: source.code("j1") == statuses.BAD_DECODING_ERROR)
+        assert source.code("other") == 0
+        assert "raise max_message_bytes" in caplog.text
+        bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0]))
+        source.until(lambda: source.code("j1") == 0)
+
+
 def test_numbers_that_json_does_not_have(bridge: Bridge) -> None:
     """rosbridge_suite writes them for floats, as Python's json does."""
     tags = JOINTS | {"count": ("DINT", "/other any_msgs/Thing count"), "text": ("STRING[9]", "/other any_msgs/Thing s")}
@@ -176,7 +190,7 @@ def test_both_values_of_a_pulse_are_published(bridge: Bridge) -> None:
 
 def test_a_large_or_a_binary_message_ends_the_connection(bridge: Bridge) -> None:
     with connected(bridge.url, JOINTS, max_message_bytes=1000) as source:
-        bridge.ask("raw", " " * 2000)
+        bridge.ask("raw", " " * 4001)
         with pytest.raises(ConnectorError, match="lost"):
             source.until(lambda: False)
     with connected(bridge.url, JOINTS) as source:
