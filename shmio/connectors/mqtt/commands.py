@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -18,10 +18,10 @@ from shmio.layout.values.write import Write
 
 
 class Command:
-    """A message to publish, the indices of the writes that it carries out, and its outcome."""
+    """A message to publish, the indices of the writes that it carries out, its values by register, and its outcome."""
 
-    def __init__(self, publication: Publication, writes: set[int]) -> None:
-        self.publication, self.writes = publication, writes
+    def __init__(self, publication: Publication, writes: set[int], values: Mapping[int, Value]) -> None:
+        self.publication, self.writes, self.values = publication, writes, values
         self.number: int | None = None
         self.outcome: str | None = None
         """"" if the broker has accepted the message, or why it was refused; None if that is not known yet."""
@@ -71,7 +71,7 @@ def plan(store: Store, options: MqttOptions, writes: Sequence[Write]) -> tuple[l
         failed, commands = False, []
         for draft in drafts:
             try:
-                commands.append(Command(_message(store, options, draft), draft.writes))
+                commands.append(Command(_message(store, options, draft), draft.writes, draft.values))
             except ValueError as error:
                 failed = True
                 for number in draft.writes:

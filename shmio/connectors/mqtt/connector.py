@@ -294,6 +294,7 @@ class MqttConnector(Connector):
             if link.fits(message):
                 self._store.expect(message.topic, message.payload, retain=message.retain)
                 command.number = link.publish(message)
+                self._store.wrote(command.values)
                 sending.sent.append(command)  # from here on, the broker may have it
             else:
                 command.outcome = "the message is larger than the broker accepts"

@@ -106,6 +106,8 @@ class Store:
         self._changed_groups: dict[Group, None] = {}
         """The groups whose state or values may have changed since the last image."""
         self._all_changed = True
+        self._written: dict[int, tuple[Value, int]] = {}
+        """The last written value of each array, with the order of the newest message at that time."""
         self._expiry_ns = 0
         """No message becomes too old before this time of CLOCK_MONOTONIC, in ns."""
         self._group_of: list[Group] = []
@@ -306,8 +308,15 @@ class Store:
             group = self._group_of[index]
             return next((watch.problem for watch in group.watches if watch.problem), group.origin.offline)
 
+    def wrote(self, values: Mapping[int, Value]) -> None:
+        """Remember values that were published, until the device sends newer ones."""
+        with self._changed:
+            for index, value in values.items():
+                if self.layout.registers[index].dims:  # only elements of arrays are written with others
+                    self._written[index] = value, self._group_of[index].origin.order_of(index)
+
     def present(self, index: int) -> Value:
-        """Return the present value of a register.
+        """Return the present value of a register: the last one that the device has sent, or that was written since.
 
         Raises:
             ValueRangeError: The register has no good value.
@@ -317,9 +326,12 @@ class Store:
             group = self._group_of[index]
             if group.state(time.monotonic_ns()) == GOOD:
                 try:
-                    return self._find(index, group.origin)[0]
+                    found = self._find(index, group.origin)[0]
                 except ValueFaultError:
                     pass
+                else:
+                    written, order = self._written.get(index, (found, -1))
+                    return written if order == group.origin.order_of(index) else found
         raise ValueRangeError("the present value is not known")
 
     def command(self, values: Mapping[int, Any]) -> tuple[str, bytes]:

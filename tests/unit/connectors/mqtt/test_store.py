@@ -10,10 +10,12 @@ from typing import Any
 import msgspec
 import pytest
 
+from shmio.connectors.mqtt.commands import plan
 from shmio.connectors.mqtt.metric import encode
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import encode as to_writes
 from shmio.model.statuses import (
     BAD,
     BAD_INDEX_RANGE_NO_DATA,
@@ -81,6 +83,28 @@ def test_numbers_that_json_does_not_have() -> None:
     broker.publish("t", {"a": -math.inf, "b": math.nan, "c": "NaN"})
     assert (broker.value("a"), broker.value("c")) == (-math.inf, "NaN")
     assert [broker.status(name).code for name in "abc"] == [GOOD, BAD_TYPE_MISMATCH, GOOD]
+
+
+def test_an_element_is_written_with_the_elements_written_before_it() -> None:
+    """The device has not sent its array since, so the first of two writes is not undone by the second."""
+    tags = {"a": {"type": "ARRAY[0..2] OF INT", "address": "t $ -> s $", "writable": True}}
+    broker = Broker(tags)
+    layout = broker.store.layout
+
+    def write(place: int, value: int) -> Any:
+        register = layout.element(layout.registers[0], (place,))
+        commands, outcomes = plan(
+            broker.store, MqttOptions(url="mqtt://127.0.0.1", max_age_ms=0), to_writes(register, value, "little")
+        )
+        assert outcomes == [""]
+        broker.store.wrote(commands[0].values)
+        return json.loads(commands[0].publication.payload)
+
+    broker.publish("t", [1, 2, 3])
+    assert write(0, 7) == [7, 2, 3]
+    assert write(2, 9) == [7, 2, 9]
+    broker.publish("t", [4, 5, 6])  # from here on, the device's own values count
+    assert write(1, 8) == [4, 8, 6]
 
 
 def test_times(caplog: pytest.LogCaptureFixture) -> None:
