@@ -31,6 +31,8 @@ class Gateway:
         self.held: list[bytes] = []
         self.late: list[bytes] = []
         """Frames to send before the next answer."""
+        self.overtaken: list[bytes] = []
+        """Frames to send after the next answer."""
 
     def __call__(self, client: socket.socket) -> None:
         while request := client.recv(300):
@@ -41,7 +43,8 @@ class Gateway:
                 self.held.append(answer[:-1] + b"\x63")  # a value that nobody may see
                 continue
             late, self.late = self.late, []
-            client.sendall(b"".join(late) + answer)
+            overtaken, self.overtaken = self.overtaken, []
+            client.sendall(b"".join(late) + answer + b"".join(overtaken))
 
     def units(self) -> list[int]:
         """Return the units that were asked since the last call."""
@@ -102,6 +105,19 @@ def test_a_late_answer_is_discarded_once_and_never_becomes_a_value() -> None:
         gateway.late = gateway.held[:1]  # the same answer once more is a fault
         with pytest.raises(ConnectorError, match="a request that is not in flight"):
             connector.read()
+
+
+def test_answers_out_of_order_reach_their_units() -> None:
+    """As from an overloaded gateway: an answer that comes after that of the next unit belongs to nobody any more."""
+    gateway = Gateway()
+    gateway.silent = {2}
+    with hostile.peer(gateway) as address, closing(source(address.port)) as connector:
+        connector.connect()
+        assert values(connector) == [1, BAD, 3]
+        gateway.overtaken = gateway.held[:1]
+        assert values(connector) == [1, BAD, 3]
+        assert values(connector) == [1, BAD, 3]
+        assert not connector._client._abandoned
 
 
 def test_a_late_answer_of_another_unit_is_a_fault() -> None:

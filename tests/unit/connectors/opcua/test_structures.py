@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import random
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from shmio.errors import ConfigError
 from shmio.layout.compiler import Source as File
 from shmio.layout.compiler import compile_sources
 from shmio.layout.tags import place_tags
+from shmio.layout.topic import find
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import (
@@ -261,6 +263,43 @@ def test_wrong_addresses(tag: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match="a: ") as raised:
         OpcUaConnector(OpcUaOptions(url="opc.tcp://127.0.0.1:1"), layout)
     assert words in str(raised.value)
+
+
+def test_a_write_of_members_changes_no_other_member(server: Device) -> None:
+    """After random writes of members, the whole structure is as the server had it, but for what was written."""
+    drawn = random.Random(7)
+    new: dict[str, Callable[[], Any]] = {
+        "count": lambda: drawn.randrange(-(1 << 31), 1 << 31), "position": lambda: drawn.randrange(100) * 10.0,
+        "name": lambda: "".join(drawn.choices("abcü", k=drawn.randrange(20))), "homed": lambda: drawn.random() < 0.5,
+        "second": drawn.random, "spare": lambda: drawn.randrange(1 << 15), "forces/1": lambda: drawn.randrange(1 << 15),
+        "forces/2..3": lambda: [drawn.randrange(1 << 15), 5],
+    }  # fmt: skip
+    now: dict[str, Any] = dict(VALUES)
+    server.ask("structure", "pump", "Pump", VALUE)
+    _, _, when = server.ask("get", "pump").partition("When=")
+    server.ask("allow", "pump")
+    try:
+        with connected(server.url, TABLE) as source:
+            until(lambda: source.value("count") == VALUE["Count"], "the structure as it was")
+            for _ in range(40):
+                written = {path: new[path]() for path in drawn.sample(sorted(new), drawn.randrange(1, 4))}
+                writes = [
+                    one
+                    for path, value in written.items()
+                    for one in encode(find(source.layout, path), value, source.layout.byte_order)
+                ]
+                assert not any(write(source.connector, writes))
+                now |= written
+                forces = now["forces"] = [now.get("forces/1", 7), *now.get("forces/2..3", [8, 9])]
+                assert server.ask("get", "pump").replace("<State.On: 1>", "1") == (
+                    f"Pump(Count={now['count']}, State=1, Axis=Axis(Position={now['position'] / 10}, "
+                    f"Name={now['name']!r}, Homed={now['homed']}), Axes=[Axis(Position=2.5, Name='a', Homed=False), "
+                    f"Axis(Position={now['second']}, Name='b', Homed=False)], Forces={forces}, Hint=None, "
+                    f"Spare={now['spare']}, When={when}"
+                ), written
+    finally:
+        server.ask("allow", "pump", False)
+        server.ask("structure", "pump", "Pump", VALUE)
 
 
 def test_browse_writes_members(server: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
