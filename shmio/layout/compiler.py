@@ -158,10 +158,10 @@ class Program:
                 )
                 report.add(Diagnostic(tables[1].file, 1, 1, what))
                 report.raise_errors()
-            self._table = tags.compile_tags(tables[0].file, tables[0].text, report)
+            self._table = tags.compile_tags(tables[0].file, tables[0].text, report, tables[0].encoding)
             self.blocks = (BlockName(self._table.name, None),)
             return
-        self._overlays = [OverlayTable(table.file, table.text) for table in tables]
+        self._overlays = [OverlayTable(table.file, table.text, table.encoding) for table in tables]
         sources = [source for source in sources if source not in tables]
         for source in sources:
             self._units.append(_read(source, report))

@@ -54,12 +54,12 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 class OverlayTable:
     """A table over a data block, as read from its file."""
 
-    def __init__(self, file: str, data: bytes) -> None:
+    def __init__(self, file: str, data: bytes, encoding: str = "") -> None:
         """Read the file; raise LayoutError if it is not a tag table."""
         self.file = file
         report = Report([file])
         if file.lower().endswith(tag_sheets.SUFFIXES):
-            sheet = read_sheet(file, data, report, _NEEDED)
+            sheet = read_sheet(file, data, report, _NEEDED, encoding)
             self.block = ""
             self._registers: Mapping[str, object] = sheet.registers
             self.line_of: Callable[[str], int] = lambda path: sheet.rows.get(path, 1)

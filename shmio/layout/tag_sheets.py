@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 from shmio.errors import Diagnostic
 from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.report import Report
+from shmio.layout.source.file import decode
 from shmio.layout.topic import shorten
 from shmio.layout.workbook import WorkbookError, read_rows
 from shmio.wording import printable, unknown
@@ -34,10 +35,15 @@ class Sheet(NamedTuple):
     rows: Mapping[str, int]
 
 
-def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> Sheet:
-    """Return the registers of a table, and add its errors to the report; each row must fill the ``needed`` columns."""
+def read_sheet(
+    file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type"), encoding: str = ""
+) -> Sheet:
+    """Return the registers of a table, and add its errors to the report; each row must fill the ``needed`` columns.
+
+    ``encoding`` is that of a CSV file that is not in UTF-8.
+    """
     try:
-        rows, comma = _rows_of(file, data)
+        rows, comma = _rows_of(file, data, encoding)
         return _sheet(file, rows, report, needed, decimal_comma=comma)
     except WorkbookError as error:
         report.add(Diagnostic(file, error.row, 1, f"the file is not a tag table: {error}"))
@@ -47,15 +53,19 @@ def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = (
         return Sheet({}, {})
 
 
-def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
+def _rows_of(file: str, data: bytes, encoding: str) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
     """Return the numbered rows, and whether numbers have a decimal comma; raise ValueError for a bad file."""
     if file.lower().endswith(".xlsx"):
         return read_rows(data, _sheet_of_tags), False
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"line {line} is not in UTF-8; save the file as 'CSV UTF-8'") from None
+    decoded = decode(data, encoding)
+    if decoded.problem:
+        what = (
+            f": {decoded.problem}"
+            if encoding
+            else " is not in UTF-8; save the file as 'CSV UTF-8', or name its encoding"
+        )
+        raise ValueError(f"line {decoded.line}{what}")
+    text = decoded.text
     header = text.partition("\n")[0]
     delimiter = max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)

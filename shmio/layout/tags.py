@@ -101,31 +101,35 @@ class _Table(msgspec.Struct, forbid_unknown_fields=True):
     byte_order: ByteOrder = "little"
 
 
-def compile_tags(file: str, data: bytes, report: Report) -> Layout:
+def compile_tags(file: str, data: bytes, report: Report, encoding: str = "") -> Layout:
     """Compile one tag table; add warnings to the report.
+
+    ``encoding`` is that of a CSV file that is not in UTF-8.
 
     Raises:
         LayoutError: The table is wrong; ``diagnostics`` has all errors and warnings.
     """
     if file.lower().endswith(tag_sheets.SUFFIXES):
-        return _compile_sheet(file, data, report)
+        return _compile_sheet(file, data, report, encoding)
     table = read_toml(file, data, report, _Table)
     lines = Lines(data.decode())
     return _place_table(file, table, report, lines.line_of)
 
 
-def _compile_sheet(file: str, data: bytes, report: Report) -> Layout:
+def _compile_sheet(file: str, data: bytes, report: Report, encoding: str) -> Layout:
     """Compile a table in a CSV file or a spreadsheet; raise LayoutError as :func:`compile_tags` does."""
-    sheet = read_sheet(file, data, report)
+    sheet = read_sheet(file, data, report, encoding=encoding)
     return _place_table(file, _Table(dict(sheet.registers)), report, lambda path: sheet.rows.get(path, 1))
 
 
-def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> tag_sheets.Sheet:
+def read_sheet(
+    file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type"), encoding: str = ""
+) -> tag_sheets.Sheet:
     """Read the rows of a CSV file or a spreadsheet; raise LayoutError if any are wrong."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, larger_than(MAX_SOURCE_BYTES)))
         report.raise_errors()
-    sheet = tag_sheets.read_sheet(file, data, report, needed)
+    sheet = tag_sheets.read_sheet(file, data, report, needed, encoding)
     report.raise_errors()
     return sheet
 

@@ -12,13 +12,9 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from shmio.layout.encodings import codec
+from shmio.layout.encodings import UTF_16, codec
 
-_MARKS = (
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-)
+_MARKS = ((codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
 _HIGH: Final = re.compile(rb"[\x80-\xff]+")
 _NEWLINE = re.compile(r"\r\n|\r|\n")
 _AS_WINDOWS = (
@@ -50,31 +46,42 @@ class Decoded:
 
 
 def decode(data: bytes, encoding: str = "") -> Decoded:
-    """Decode a source: by its byte order mark, or else as ``encoding``.
+    """Decode a source: by its byte order mark, or else as UTF-8, or else as ``encoding``.
 
-    If ``encoding`` is empty, decode the source as UTF-8, or else as Windows-1252. Otherwise it is the
-    name of one of :data:`shmio.layout.encodings.NAMES`.
+    Text in another encoding is practically never valid UTF-8. If ``encoding`` is empty, it is
+    Windows-1252, which is a guess. Otherwise it is one of :data:`shmio.layout.encodings.NAMES` or
+    UTF-16.
     """
-    given = encoding
-    mark, encoding = next(
-        ((mark, name) for mark, name in _MARKS if data.startswith(mark)), (b"", codec(given) if given else "utf-8")
-    )
-    data = data[len(mark) :]
+    for mark, name in _MARKS:
+        if data.startswith(mark):
+            problem = (
+                f"the file has the byte order mark of {name.upper()}, but other bytes follow; export the source again"
+            )
+            return _exactly(data[len(mark) :], name, problem)
+    data = data.removeprefix(codecs.BOM_UTF8)
+    given = codec(encoding) if encoding else ""
     try:
-        return Decoded(data.decode(encoding))
+        return Decoded(data.decode(UTF_16 if given == UTF_16 else "utf-8"))
     except UnicodeDecodeError as error:
-        line, column = _place(data[: error.start].decode(encoding, "replace"))
-    if given and not mark:
-        problem = f"the bytes here are not {given}; name the encoding in which the file was saved"
-        return Decoded("", problem, line, column, fatal=True)
-    if encoding != "utf-8":
-        problem = f"the file has the byte order mark of {encoding.upper()}, but other bytes follow; "
-        return Decoded("", f"{problem}export the source again", line, column, fatal=True)
+        line, column = _place(data[: error.start].decode("utf-8", "replace"))
+    if given:
+        return _exactly(
+            data, given, f"the bytes here are not {encoding}; name the encoding in which the file was saved"
+        )
     try:
         text = data.decode("cp1252")
     except UnicodeDecodeError:
         text = data.decode("latin-1")  # because five bytes have no character in Windows-1252
     return Decoded(text, _AS_WINDOWS, line, column, eastern=_is_eastern(data))
+
+
+def _exactly(data: bytes, encoding: str, problem: str) -> Decoded:
+    """Decode bytes; ``problem`` is the error if they are not in the encoding."""
+    try:
+        return Decoded(data.decode(encoding))
+    except UnicodeDecodeError as error:
+        line, column = _place(data[: error.start].decode(encoding, "replace"))
+    return Decoded("", problem, line, column, fatal=True)
 
 
 def _is_eastern(data: bytes) -> bool:

@@ -173,6 +173,7 @@ def test_opcua_serves_a_data_block_as_an_s7_1500_does() -> None:
         VERSION : 0.1
         STRUCT
             Speed : Real := 12.5;
+            Wait : TON_TIME;
             Axes : Array[1..2] of Struct
                 Pos : DInt := 3;
             END_STRUCT;
@@ -183,7 +184,8 @@ def test_opcua_serves_a_data_block_as_an_s7_1500_does() -> None:
     layout = layout.with_statuses()
     served = Served(layout, {"nodes": "siemens"})
     with device("opcua", [served]) as (_, address), connected("opcua", address, layout, nodes="siemens") as connector:
-        assert values(connector, layout) == {"Speed": 12.5, "Axes/1/Pos": 3, "Axes/2/Pos": 3}
+        timer = {"Wait/PT": 0, "Wait/ET": 0, "Wait/IN": False, "Wait/Q": False}
+        assert values(connector, layout) == {"Speed": 12.5, **timer, "Axes/1/Pos": 3, "Axes/2/Pos": 3}
         assert write(connector, layout, "Axes/2/Pos", -7) == [""]
         until(lambda: values(connector, layout)["Axes/2/Pos"] == -7, "the written value")
 
