@@ -107,7 +107,7 @@ START_PROCESSES = (
     "tests/unit/lab/",
     "tests/unit/plan/test_emulated_programs.py",
     "tests/unit/plan/test_sources_models.py",
-    "tests/unit/simulation/fmu/test_fmu_model.py",
+    "tests/unit/simulation/fmu/test_fmu_",
     "tests/unit/simulation/fmu/test_howto.py",
     "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",
     "tests/unit/simulation/test_howto.py",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import json
+import math
 import random
 import shutil
 import socket
@@ -29,7 +30,7 @@ from shmio.connectors.modbus.client import ModbusClient
 from shmio.connectors.opcua import decode
 from shmio.connectors.ros import cdr, websocket
 from shmio.connectors.ros import messages as ros
-from shmio.connectors.ros.addresses import FieldError
+from shmio.connectors.ros.addresses import FieldError, extract, parse
 from shmio.connectors.ros.values import ValueConverter
 from shmio.connectors.s7 import pdu, userdata
 from shmio.connectors.s7.transport import Inbox
@@ -279,17 +280,18 @@ def _check_sparkplug(data: bytes) -> None:
 
 def _mqtt_payloads() -> list[bytes]:
     document = json.dumps({"a": [{"a": 1}], "b": {"c": [[1, 2], [3, 4]]}, "t": "2024-02-29T12:00:00Z"}).encode()
-    return [document, b"12", b"true", b"-1.5e3", b'"text"', b"[1, [2, 3]]", "Größe".encode()]
+    objects = json.dumps([{"id": "x", "v": 5, "q": 192, "t": 1709208000}, {"id": 7, "v": math.nan}]).encode()
+    return [document, objects, b"12", b"true", b"-1.5e3", b'"text"', b"[1, [2, 3]]", "Größe".encode()]
 
 
 def _check_mqtt(data: bytes) -> None:
-    paths = ("$", "$.a", "$.a[0].a", "$.b.c", "$[1]")
+    paths = ("$", "$.a", "$.a[0].a", "$.b.c", "$[1]", "$[id=x].v")
     tags: dict[str, Any] = {
         f"{at}/{n}": (kind, f"t {path}" if at else "t")
         for at, path in enumerate(paths)
         for n, kind in enumerate(mqtt.KINDS)
     }
-    store = mqtt.store_of(tags, time="$.t")
+    store = mqtt.store_of(tags, time="@.t", quality="@.q")
     store.take("t", data, retained=False)
     mqtt.check(store)
     mqtt._browse([("a/b", data)])
@@ -298,7 +300,9 @@ def _check_mqtt(data: bytes) -> None:
 def _ros_messages() -> list[bytes]:
     kinds = sorted(ros.DEFINITIONS)
     return [bytes((at,)) + json.dumps(ros.default(kind)).encode() for at, kind in enumerate(kinds)] + [
-        bytes((kinds.index("sensor_msgs/JointState"),)) + b'{"name": ["a"], "position": [0.5], "effort": [1]}'
+        bytes((kinds.index("sensor_msgs/JointState"),)) + b'{"name": ["a"], "position": [0.5], "effort": [1]}',
+        b'\0{"layout": {"dim": [{"size": 2, "stride": 2}, {"size": 1, "stride": 1}]}, "data": [NaN, 2]}',
+        b'\0{"op": "publish", "topic": "/t", "msg": {"a": [Infinity, 1e999]}}',
     ]
 
 
@@ -327,8 +331,14 @@ def _ros_registers() -> list[ValueConverter]:
     return [ValueConverter(register, None) for register in place_tags("x", tags).registers]
 
 
+_MATRIX = parse("/m std_msgs/Float64MultiArray data")
+
+
 def _check_ros(data: bytes) -> None:
+    websocket._read(data[1:])
     found = websocket.decode(msgspec.Raw(data[1:]))
+    with suppress(FieldError):
+        extract(found, _MATRIX)
     kinds = sorted(ros.DEFINITIONS)
     if found is None or not data:
         return

@@ -77,10 +77,10 @@ def test_texts(payloads: list[bytes]) -> None:
 @given(VALUES)
 @example({"a": [{"a": 1}], "b": {"c": [[1, 2], [3, 4]]}})
 def test_json(document: Any) -> None:
-    paths = ("$", "$.a", "$.a[0].a", "$.b.c", "$[1]", "$['c']")
+    paths = ("$", "$.a", "$.a[0].a", "$.b.c", "$[1]", "$['c']", "$[a=1].b", "$.b[c=x].a")
     tags = {f"{at}/{n}": (kind, f"t {path}") for at, path in enumerate(paths) for n, kind in enumerate(KINDS)}
     tags |= {f"array{at}": ("ARRAY[1..2,1..2] OF INT", f"t {path}") for at, path in enumerate(paths)}
-    store = store_of(tags, time="$.a")
+    store = store_of(tags, time="$.a", quality="@.b")
     with contextlib.suppress(UnicodeEncodeError):
         store.take("t", json.dumps(document).encode(), retained=False)
         check(store)
