@@ -70,6 +70,7 @@ def _add(found: Found, row: Mapping[str, str], line: int, clamped: list[str]) ->
             "unit": row.get("eng units"),
             "comment": row.get("description"),
             "scale": scale,
+            "byte_order": "little" if place.low_first else None,
             "writable": writable,
         },
         line,

@@ -25,6 +25,7 @@ class Place(NamedTuple):
         address: The address, without a type.
         kind: The type there, such as ``UINT`` or ``STRING[20]``.
         dims: Bounds of an array; ``()`` for a single value.
+        low_first: True if the low byte of each word comes first, unlike in Modbus.
 
     """
 
@@ -32,6 +33,7 @@ class Place(NamedTuple):
     address: str
     kind: str
     dims: Dims
+    low_first: bool = False
 
 
 NUMBERS: Final = {
@@ -41,6 +43,7 @@ NUMBERS: Final = {
 """Types of numbers in KEPServerEX, and their S7 names."""
 KINDS: Final = {"boolean": "BOOL", "string": "STRING", **NUMBERS}
 _SHAPE: Final = re.compile(r"(?P<place>[^\[\]]*?)\s*(?P<counts>(?:\[\s*[0-9]{1,6}\s*\]\s*){0,3})")
+_MAX_TEXT: Final = 240  # characters of a text in Modbus
 _MODBUS: Final = re.compile(
     r"(?:(?P<hex>H)?(?P<table>[0134])(?P<item>[0-9A-F]{1,5}))(?:\.(?P<part>[0-9]{1,3})(?P<text>[HL]?))?"
 )
@@ -109,11 +112,9 @@ def _in_modbus(address: str, match: re.Match[str], kind: str, dims: Dims) -> Pla
     if kind == "default":
         kind = "string" if match["text"] else "boolean" if is_bit or part is not None else "word"
     if kind == "string":
-        if is_bit or match["text"] != "H" or not part or not 1 <= int(part) <= 240 or dims:
-            raise ValueError(
-                f"{address!r}: a text needs words with the high byte first, and its length, as in 400100.20H"
-            )
-        return Place(True, number, f"STRING[{int(part)}]", ())
+        if is_bit or not match["text"] or not 1 <= int(part) <= _MAX_TEXT or dims:
+            raise ValueError(f"{address!r}: a text needs words, its length, and H or L, as in 400100.20H")
+        return Place(True, number, f"STRING[{int(part)}]", (), low_first=match["text"] == "L")
     if kind == "boolean":
         if is_bit == (part is not None) or match["text"] or (part is not None and (int(part) > 15 or dims)):
             raise ValueError(

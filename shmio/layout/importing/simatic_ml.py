@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+import msgspec
+
 from shmio.errors import Diagnostic, LayoutError, ValueRangeError
 from shmio.layout.compiler import Parsed, Program, Source, is_of_access
 from shmio.layout.importing import xml_tree
@@ -113,7 +115,8 @@ def _add_blocks(
             addresses: Mapping[str, Register] = {}
             if placed is not None and not layout.optimized:
                 addresses, more = _placed(placed, name, type_bytes)
-                warnings += more
+                places = {(one.file, one.line) for one in more}
+                warnings = [*(one for one in warnings if (one.file, one.line) not in places), *more]
         except LayoutError as error:
             faults = error.diagnostics or (str(error),)
             found.skip(name, f"the data block cannot be placed: {faults[0]}", node.line)
@@ -122,8 +125,9 @@ def _add_blocks(
         found.remarks += [text for text in dict.fromkeys(shown) if text not in found.remarks]
         if single:
             found.block = name
-        if not layout.optimized and placed is not None and layout.number is None:
-            found.remarks.append(f"{name} has no number, so its members have no addresses")
+        if not layout.optimized and placed is not None and (layout.number is None or not addresses):
+            why = "has no number" if layout.number is None else "has no member whose address is known"
+            found.remarks.append(f'{name} {why}: the column is empty; read the block by OPC UA with nodes = "siemens"')
         _add_block(found, layout, addresses, () if single else (name,), node.line)
     found.remarks += [f"--type-bytes: no member has the type {name!r}" for name in sorted(unused)]
 
@@ -135,7 +139,7 @@ def _placed(
     try:
         compiled = program.compile((name,), type_bytes)
     except LayoutError as error:
-        return {}, [one for one in error.diagnostics if one.severity == "error"]
+        return {}, [msgspec.structs.replace(one, severity="warning") for one in error.diagnostics]
     return {one.path: one for one in compiled.layouts[0].registers}, [*compiled.warnings]
 
 

@@ -104,7 +104,8 @@ def test_addresses_of_kepserver() -> None:
         ("300005", "Float"): ("REAL", "300005"),
         ("000001", "Boolean"): ("BOOL", "000001"), ("100017", "Boolean"): ("BOOL", "100017"),
         ("400001.3", "Boolean"): ("BOOL", "400001.3"), ("400001.15", "Default"): ("BOOL", "400001.15"),
-        ("400100.20H", "String"): ("STRING[20]", "400100"), ("400001", "Default"): ("UINT", "400001"),
+        ("400100.20H", "String"): ("STRING[20]", "400100"), ("400100.20L", "String"): ("STRING[20]", "400100"),
+        ("400001", "Default"): ("UINT", "400001"),
         ("000001 [8]", "Boolean Array"): ("ARRAY[0..7] OF BOOL", "000001"),
         ("400010 [2][3]", "Long Array"): ("ARRAY[0..1, 0..2] OF DINT", "400010"),
         ("400001", "QWord"): ("ULINT", "400001"), ("400001", "Double"): ("LREAL", "400001"),
@@ -127,9 +128,11 @@ def test_addresses_of_kepserver() -> None:
     }  # fmt: skip
     for (address, data_type), expected in good.items():
         assert places(kep(address, data_type)) == {"x": expected}, address
+    assert kep("400100.20L", "String").tags["x"]["byte_order"] == "little"
+    assert "byte_order" not in kep("400100.20H", "String").tags["x"]
     bad = [
         ("DB5,WORD62", "BCD"), ("400001", "LBCD"), ("400001", "Date"), ("400001", "Boolean"), ("400001.16", "Boolean"),
-        ("000001", "Word"), ("000001#16", "Word"), ("400100.20L", "String"), ("400100", "String"), ("400000", "Word"),
+        ("000001", "Word"), ("000001#16", "Word"), ("400100", "String"), ("400000", "Word"),
         ("40000A", "Word"), ("200001", "Word"), ("400001 [0]", "Word Array"), ("400001 [2][3][4]", "Word Array"),
         ("400001 [3]", "Word"), ("400001", "Word Array"), ("400001.3 [4]", "Boolean Array"), ("DB5,INT2", "Float"),
         ("DB5,INT2", "Long"), ("DB5,REAL4", "Double"), ("DB5,INT2", "Boolean"), ("DB5,INT2.3", "Short"),
