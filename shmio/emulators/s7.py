@@ -77,7 +77,11 @@ _PERIPHERAL = 0x80
 _AREAS = {int(area): area for area in S7Area} | {_PERIPHERAL: S7Area.PE}  # peripheral access reaches only inputs
 _NUMBERED = {S7Area.CT: S7WordLen.COUNTER, S7Area.TM: S7WordLen.TIMER}
 """Areas that are addressed by number, with the type that they need."""
-_READ_ONLY = frozenset(_NUMBERED.values())
+_DB_READ = 0xB0
+"""Syntax of an item that reads parts of data blocks; it stands here for the type of the item, too."""
+_PART = struct.Struct(">BHH")  # bytes, DB and offset of such a part
+_ANSWERS: Mapping[int, tuple[int, int, bool]] = _TYPES | {_DB_READ: (1, 0x09, False)}
+_READ_ONLY = frozenset({*_NUMBERED.values(), _DB_READ})
 """Types of items that real CPUs do not let clients write."""
 
 _TPKT = struct.Struct(">BxH")
@@ -279,12 +283,37 @@ class Jobs:
         return _acknowledgement(reference, bytes((_WRITE, len(items))), codes)
 
     def _items(self, parameters: memoryview, *denials: Fault) -> list[_Item]:
-        if not parameters[1] or len(parameters) != 2 + _ITEM.size * parameters[1]:
+        items: list[_Item] = []
+        at = 2
+        while at + 4 <= len(parameters):
+            if parameters[at + 2] == _DB_READ:
+                end = at + 2 + parameters[at + 1]
+                items.append(self._several(parameters[at + 4 : end], parameters[at + 3]))
+            elif (end := at + _ITEM.size) <= len(parameters):
+                items.append(self._item(_ITEM.unpack_from(parameters, at)))
+            at = end
+        if not items or len(items) != parameters[1] or at != len(parameters):
             raise _MalformedJobError
-        items = [self._item(_ITEM.unpack_from(parameters, at)) for at in range(2, len(parameters), _ITEM.size)]
         if self._options.fault in denials:
             return [_Item(_DENIED, bytearray(), 0, 0, 0, item.type) for item in items]
         return items
+
+    def _several(self, addresses: memoryview, count: int) -> _Item:
+        """Return an item of parts of data blocks, as WinCC reads them from an S7-400: each with its own return code.
+
+        Here the item as a whole is refused if one of its parts does not exist.
+        """
+        if not count or len(addresses) != count * _PART.size:
+            raise _MalformedJobError
+        values = bytearray()
+        for size, number, start in _PART.iter_unpack(addresses):
+            place = int(S7Area.DB) << 24 | start * 8
+            part = self._item((0x12, 0x0A, 0x10, int(S7WordLen.BYTE), size, number, place))
+            if part.code != _OK:
+                return part._replace(type=_DB_READ)
+            values.append(_OK)
+            values += part.area[start : start + size]
+        return _Item(_OK, values, 0, len(values), 0, _DB_READ)
 
     def _item(self, fields: tuple[int, ...]) -> _Item:
         specification, length, syntax, kind, count, number, place = fields
@@ -326,7 +355,7 @@ def _acknowledgement(reference: int, parameters: bytes, data: bytes | bytearray 
 def _read_item(item: _Item) -> bytes:
     if item.code != _OK:
         return _ITEM_HEAD.pack(item.code, 0, 0)
-    _, transport, in_bits = _TYPES[S7WordLen(item.type)]
+    _, transport, in_bits = _ANSWERS[item.type]
     data = bytes(item.area[item.start : item.start + item.size])
     if item.type == _BIT:
         data = bytes((data[0] >> item.bit & 1,))

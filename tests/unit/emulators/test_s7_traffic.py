@@ -50,6 +50,9 @@ NO_BLOCK = (
     bytes.fromhex("03000025 02f080 32070000 0b00 0008 000c 0001120411430300 ff090008 3041303030303041"),
     bytes.fromhex("03000021 02f080 32070000 0b00 000c 0004 000112081283030000 00d209 0a000000"),
 )
+READ_OF_PARTS = bytes.fromhex("03000026 02f080 32010000 0d00 0015 0000 0401 1211b003 02004a006c 04004c0194 020051003c")
+"""WinCC reads parts of three data blocks of an S7-400."""
+ANSWER_OF_PARTS = bytes.fromhex("03000024 02f080 32030000 0d00 0002 000f 0000 0401 ff09000b ff040a ff0544053e ff040a")
 STRANGERS = [bytes.fromhex(text) for text in (
     "03000013 02f080 32020000 0001 0000 0000 0000",  # an Ack
     "03000019 02f080 32070000 0000 0008 0000 0100101000000000",  # a push
@@ -60,6 +63,8 @@ STRANGERS = [bytes.fromhex(text) for text in (
 def served(options: ServerOptions | None = None) -> Iterator[S7Server]:
     with S7Server(Address("127.0.0.1", 0), options=options or ServerOptions(240, 2)) as server:
         server.add_block(1, bytearray.fromhex("babe 01 00 feadbeef aabbccdd"))
+        for number, start, data in ((74, 108, b"\4\x0a"), (76, 404, b"\5\x44\5\x3e"), (81, 60, b"\4\x0a")):
+            server.add_block(number, bytearray(start) + data)
         for area in (SrvArea.PE, SrvArea.PA):
             server.add_area(area, bytearray(16))
         server.add_area(SrvArea.MK, bytearray(b"\0\3".ljust(32, b"\0")))
@@ -87,12 +92,29 @@ def test_answers_are_those_of_the_cpus() -> None:
         peer.sendall(CONNECT)
         confirm = frame_of(stream)
         assert confirm[:8] + confirm[10:] == CONFIRM[:8] + CONFIRM[10:]  # but for the CPU's own reference
-        for request, answer in [(SETUP, GRANT), (READ_OF_EIGHT, ANSWER_OF_EIGHT), (WRITE, WRITTEN), NO_BLOCK]:
+        for request, answer in [
+            (SETUP, GRANT),
+            (READ_OF_EIGHT, ANSWER_OF_EIGHT),
+            (WRITE, WRITTEN),
+            NO_BLOCK,
+            (READ_OF_PARTS, ANSWER_OF_PARTS),
+        ]:
             peer.sendall(request)
             assert frame_of(stream).hex(" ") == answer.hex(" ")
         peer.sendall(NO_LIST[0])
         refusal = frame_of(stream)
         assert refusal[:24] + refusal[25:] == NO_LIST[1][:24] + NO_LIST[1][25:]  # but for the sequence number
+
+
+def test_parts_of_blocks_that_are_missing_or_written() -> None:
+    beyond = READ_OF_PARTS[:-1] + b"\x3d"  # one byte beyond the end
+    write = bytes.fromhex("03000021 02f080 32010000 0d00 000b 0005 0501 1207b001 01004a006c 00040008 01")
+    with served() as server, dialled(server) as (peer, stream):
+        peer.sendall(CONNECT + SETUP + beyond + write + READ_OF_PARTS)
+        frame_of(stream), frame_of(stream)
+        assert frame_of(stream)[-6:] == bytes.fromhex("0401 05000000")
+        assert frame_of(stream)[-3:] == bytes.fromhex("0501 03")
+        assert frame_of(stream) == ANSWER_OF_PARTS
 
 
 def test_empty_tpdus_and_messages_that_need_no_answer_are_skipped() -> None:
