@@ -16,8 +16,16 @@ from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 
 
-def answer(mode: int = 0x48, *, code: int = 0xFF, szl: int = 0x0424, records: int = 1, error: int = 0) -> memoryview:
-    record = struct.pack(">HBB16x", 0x4302, 0xFF, mode) if records else b""
+def answer(
+    mode: int = 0x48,
+    *,
+    code: int = 0xFF,
+    szl: int = 0x0424,
+    records: int = 1,
+    error: int = 0,
+    identity: int = 0x4302,
+) -> memoryview:
+    record = struct.pack(">HBB16x", identity, 0xFF, mode) if records else b""
     data = struct.pack(">HHHH", szl, 0, 20, records) + record
     parameters = bytes.fromhex("000112 08 12 84 01 05 00 00") + struct.pack(">H", error)
     body = parameters + struct.pack(">BBH", code, 9, len(data)) + data
@@ -52,6 +60,13 @@ def test_doubt_of_each_mode(mode: int, doubt: str) -> None:
     question.accept(0, answer(mode))
     assert question.complete
     assert re.search(doubt or "^$", question.doubt)
+
+
+def test_the_record_of_a_real_cpu_in_run() -> None:
+    question = ModeQuery()
+    question.begin(0, 10)
+    question.accept(0, answer(0x08, identity=0x5144))  # in a capture: 5144ff08
+    assert question.doubt == ""
 
 
 def test_mode_is_asked_once_an_interval() -> None:

@@ -216,3 +216,15 @@ def test_fixed_bytes_of_each_type_decode_to_known_values(type_: str, raw: str, c
     assert table.value(0) == value
     if column in KINDS:
         assert not change.values.flags.writeable
+
+
+@given(paths=chosen, encoding=st.sampled_from(["windows-1252", "gbk", "utf-8"]), seed=seeds)
+def test_texts_have_the_encoding_of_their_register(paths: list[str], encoding: str, seed: int) -> None:
+    """Any bytes become texts that the wire can hold, and the client knows the encoding."""
+    layout, image = LAYOUT.with_encoding(encoding), random_image(seed)
+    registers = [layout.registers[layout.by_path[path]] for path in paths]
+    columns = Columns(registers, layout.byte_order)
+    table = table_of(registers, columns)
+    table.apply(Values.FromString(pack(columns.decode(image))))
+    check(table, registers, layout, image)
+    assert [one.encoding for one in table.registers] == [one.encoding for one in registers]
