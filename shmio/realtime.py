@@ -1,4 +1,4 @@
-"""How the kernel gives processors to threads: real-time priority (sched(7)), and how long a process has waited.
+"""How the kernel gives processors to threads: real-time priority (sched(7)), and how long they ran and waited.
 
 A thread with real-time priority runs before all threads without it.
 """
@@ -9,6 +9,7 @@ import os
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple, Self
 
 from shmio.errors import ConfigError
 
@@ -46,15 +47,31 @@ def check(priority: int) -> None:
         raise refused[0]
 
 
-def waited_ns(pid: int) -> int:
-    """Return how long the threads of a process have waited for a processor, in ns; 0 if unknown.
+class ProcessorTime(NamedTuple):
+    """How the kernel has scheduled a process, in ns: the sums for all its threads.
 
-    This is the sum for all threads: while a thread waits for another one's lock, only the other
-    counts as waiting.
+    While a thread waits for another one's lock, only the other counts as running or waiting.
     """
-    waited = 0
-    with suppress(OSError):  # the process has ended
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            with suppress(OSError, IndexError, ValueError):  # the thread has ended; or proc(5): a kernel lacks the file
-                waited += int((thread / "schedstat").read_text().split()[1])
-    return waited
+
+    ran_ns: int = 0
+    waited_ns: int = 0
+    """Time for which threads could run, but had to wait for a processor."""
+
+    @classmethod
+    def of(cls, pid: int) -> Self:
+        """Return the times of a process; 0 if unknown."""
+        ran = waited = 0
+        with suppress(OSError):  # the process has ended
+            for thread in Path(f"/proc/{pid}/task").iterdir():
+                with suppress(OSError, IndexError, ValueError):  # it has ended; or proc(5): a kernel lacks the file
+                    figures = (thread / "schedstat").read_text().split()
+                    ran += int(figures[0])
+                    waited += int(figures[1])
+        return cls(ran, waited)
+
+    def since(self, earlier: ProcessorTime) -> ProcessorTime:
+        """Return the times since an earlier moment. The times of threads that have ended since then are missing."""
+        return ProcessorTime(max(0, self.ran_ns - earlier.ran_ns), max(0, self.waited_ns - earlier.waited_ns))
+
+    def __str__(self) -> str:
+        return f"its threads ran for {self.ran_ns / 1e9:.1f} s and waited {self.waited_ns / 1e9:.1f} s for a processor"

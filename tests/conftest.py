@@ -162,6 +162,8 @@ APART = (
     "tests/system/test_mtconnect_package.py",
     "tests/system/test_opcua_gateway.py",
     "tests/system/test_umati.py",
+    # 20 busy loops would disturb the tests beside it; test_policy.py has recorded figures of such a load
+    "tests/unit/supervisor/test_overload.py",
     # every byte of a file; the tests beside them cut and change it at chosen places
     "tests/unit/cli/test_dump_rewriting.py::test_recover_of_a_file_cut_off_at_every_byte",
     "tests/unit/recorder/test_finalise.py::test_a_file_cut_anywhere",

@@ -177,6 +177,8 @@ class OpcUaEmulator:
     async def _serve(self) -> None:
         from asyncua import Server, ua  # noqa: PLC0415  it needs the extra
 
+        from shmio.emulators.opcua_parts import serve_parts  # noqa: PLC0415  it needs the extra
+
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # the library logs errors of clients
         server = Server()
         await server.init()
@@ -185,6 +187,7 @@ class OpcUaEmulator:
         server.set_server_name("shmio emulator")
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
         server.iserver.max_connections = MAX_CLIENTS
+        serve_parts(server)
         self._nodes = _Nodes(server)
         await self._replace(self._contents)
         try:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol
 
 from shmio.errors import EndpointError
-from shmio.realtime import waited_ns
+from shmio.realtime import ProcessorTime
 from shmio.worker import BEAT_S, Worker
 
 START_S: Final = 10.0
@@ -27,9 +27,10 @@ LATE_S: Final = 1.0
 CONNECT_S: Final = 1.0
 """Longest time in s to open the connection for the questions."""
 HANG_S: Final = 5.0
-"""Time in s without an answer after which the server counts as hung, as the supervisor's processes do."""
-HANG_MOST_S: Final = 20.0
-"""The longest time for a server that has waited for a processor for at least half of the time."""
+"""Time in s without an answer after which the server counts as hung, as the supervisor's processes do.
+
+Time for which it has waited for a processor does not count.
+"""
 
 
 class Probe(NamedTuple):
@@ -168,8 +169,8 @@ class Liveness:
         self._checked_s: float | None = None
         """When the server was asked, or when its answer was last looked for; None: no answer is due."""
         self._quiet_s = 0.0
-        self._waited_ns: int | None = None
-        """Time in ns that the server had waited for a processor when its answer became late; None: it is not late."""
+        self._used: ProcessorTime | None = None
+        """How the server had been scheduled when its answer became late; None: it is not late."""
         self.problem = ""
         """That the server does not answer; empty if it does."""
         self.hangs = False
@@ -201,7 +202,7 @@ class Liveness:
             answered = True
         if answered:
             self._asked, self._answered_s, self._quiet_s = False, now_s, 0.0
-            self._checked_s, self._waited_ns, self.problem = None, None, ""
+            self._checked_s, self._used, self.problem = None, None, ""
         else:
             self._judge(pid)
 
@@ -223,14 +224,16 @@ class Liveness:
     def _judge(self, pid: int) -> None:
         if self._quiet_s < LATE_S:
             return
-        present_ns = waited_ns(pid)
-        if self._waited_ns is None:
-            self._waited_ns = present_ns
+        present = ProcessorTime.of(pid)
+        if self._used is None:
+            self._used = present
+        used = present.since(self._used)
         self.problem = f"{self._name} has not answered for {self._quiet_s:.0f} s"
-        overloaded = 2 * (present_ns - self._waited_ns) >= self._quiet_s * 1e9
-        if self._quiet_s >= (HANG_MOST_S if overloaded else HANG_S):
+        if self._quiet_s - used.waited_ns / 1e9 >= HANG_S:  # a server that gets no processor does not hang
             self.hangs = True
-            raise EndpointError(f"{self._name} hangs: it has not answered for {self._quiet_s:.0f} s, so it was killed")
+            raise EndpointError(
+                f"{self._name} hangs: it has not answered for {self._quiet_s:.0f} s, in which {used}; it was killed"
+            )
 
     def close(self) -> None:
         """Close the connection to the server."""

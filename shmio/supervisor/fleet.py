@@ -17,9 +17,10 @@ from shmio.control import Answer
 from shmio.local.status import complaint as complaint_of
 from shmio.logs import fields
 from shmio.plan.processes import Job, rank
+from shmio.realtime import ProcessorTime
 from shmio.segment import Activity, ProcessSlot, ProcessSpec, Segment, Supervised, stale_segment
 from shmio.supervisor import policy
-from shmio.supervisor.policy import PHASES, Action, Event, Life, Limits, State
+from shmio.supervisor.policy import NOT_LATE, PHASES, Action, Event, Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 
 TICK_S: Final = 0.1
@@ -48,8 +49,8 @@ class ManagedProcess:
         self._job: Job | None = None
         self._beat_ns = 0
         self._quiet_ns = 0
-        self._waited_ns: int | None = None
-        """How long the process had waited for a processor when its heartbeat was first late; None: it is not late."""
+        self._used: ProcessorTime | None = None
+        """How the process had been scheduled when its heartbeat was first late; None: it is not late."""
 
     @property
     def name(self) -> str:
@@ -164,18 +165,18 @@ class ManagedProcess:
         self._beat_ns = beat_ns
         self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
         if self._quiet_ns < LATE_S * 1e9:
-            self._waited_ns = None
-        elif self._waited_ns is None and self.child is not None:
-            self._waited_ns = self.child.waited_ns()
+            self._used = None
+        elif self._used is None and self.child is not None:
+            self._used = self.child.processor_time()
         return self._quiet_ns
 
-    def waited_ns(self) -> int:
-        """Return the time in ns for which the process has waited for a processor.
+    def processor_time(self) -> ProcessorTime:
+        """Return how long the process has run, and waited for a processor.
 
-        The time is counted from the start of the process or, if its heartbeat is late, from the time
+        The times are counted from the start of the process or, if its heartbeat is late, from the time
         at which the heartbeat became late.
         """
-        return 0 if self.child is None else self.child.waited_ns() - (self._waited_ns or 0)
+        return NOT_LATE if self.child is None else self.child.processor_time().since(self._used or NOT_LATE)
 
     def end_note(self, pid: int, code: int | None) -> str:
         """Return why the process ``pid`` ended, with its last message if there is one.
@@ -331,18 +332,19 @@ class Fleet:
                 self._evict(managed)
             late = managed.life.state is State.STARTING and now_ns >= (managed.life.due_ns or now_ns)
             hangs = quiet_ns >= self._limits.hang_s * 1e9
-            waited_ns = managed.waited_ns() if late or hangs else 0
+            used = managed.processor_time() if late or hangs else NOT_LATE
             event = policy.due(
                 managed.life,
                 now_ns,
                 ready=managed.ready,
                 quiet_ns=quiet_ns,
                 limits=self._limits,
-                waited_ns=waited_ns,
+                used=used,
             )
             if event is not None:
                 dying = managed.child if managed.life.killed else None
-                self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")
+                evidence = f"meanwhile {used}" if late or hangs else ""
+                self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else evidence)
 
     def _evict(self, managed: ManagedProcess) -> None:
         """Kill a foreign process that occupies the slot of one of our processes.

@@ -12,6 +12,7 @@ from enum import Enum
 from typing import Final
 
 from shmio.backoff import Backoff
+from shmio.realtime import ProcessorTime
 from shmio.segment import Phase, Quality
 
 
@@ -125,6 +126,7 @@ LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.
 """States in which an operating-system process exists."""
 
 
+NOT_LATE: Final = ProcessorTime()
 REFUSED_STATUS = 2
 """Exit status of a process that can never work as configured."""
 RESTART: Final = Backoff(0.5, 10.0)
@@ -136,13 +138,9 @@ class Limits:
     """Time-outs and counts for the processes. All times are in s."""
 
     start_s: float = 20.0
-    """Time-out from the start of a process until it reports that it runs."""
-    start_most_s: float = 60.0
-    """Time-out of a start during which the process has waited for a processor for at least half of the time."""
+    """Time-out from the start of a process until it reports that it runs, without waits for a processor."""
     hang_s: float = 5.0
-    """Longest time without a heartbeat while a process runs; after that, it counts as hung."""
-    hang_most_s: float = 20.0
-    """The longest time for a process that has waited for a processor for at least half of the time."""
+    """Longest time without a heartbeat while a process runs, without waits for a processor; after that, it hangs."""
     grace_s: float = 5.0
     """Time from SIGTERM to SIGKILL."""
     kill_s: float = 5.0
@@ -191,7 +189,7 @@ class Life:
 def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
     """Return the state of a process after an event, and the action to take; None if there is no action.
 
-    ``note`` says how the process ended, if that is the event.
+    ``note`` says how the process ended, or from what it is known that it hangs, if that is the event.
     """
     edge = GRAPH[life.state].get(event)
     if edge is None:
@@ -200,7 +198,7 @@ def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") 
     killed = action is Action.KILL or (life.killed and event not in (Event.EXIT, Event.REFUSAL))
     stuck = killed and (life.stuck or (life.killed and event is Event.ELAPSED))
     if state is State.HUNG and life.state is not State.HUNG:
-        life = replace(life, hang=_hang(life, limits))
+        life = replace(life, hang="; ".join(filter(None, (_hang(life, limits), note))))
     text = (note or life.note) if stuck else _note(life, state, note)
     crashes = _crashes(life, event, state, now_ns, limits)
     life = replace(life, crashes=crashes, note=text, killed=killed, stuck=stuck)
@@ -252,8 +250,13 @@ def backoff_s(crashes: int, limits: Limits) -> float:
     return limits.backoff.wait_s(crashes - 2) if crashes > 1 else 0.0
 
 
-def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, waited_ns: int = 0) -> Event | None:
+def due(
+    life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, used: ProcessorTime = NOT_LATE
+) -> Event | None:
     """Return the event that the present time or the process's report causes; None if there is no event.
+
+    A process that gets no processor does not hang, however long this takes: only the time counts in which
+    it ran, or waited for something else.
 
     Args:
         life: The state of the process.
@@ -261,19 +264,17 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
         ready: True if the process has reported that it runs.
         quiet_ns: Time since the last heartbeat, in ns.
         limits: The limits that apply.
-        waited_ns: How long the process has waited for a processor, in ns: since its start or, if it
-            runs, during the time without a heartbeat.
+        used: How the process was scheduled since its start or, if it runs, during the time without a
+            heartbeat.
 
     """
     if life.state is State.STARTING:
         if ready:
             return Event.READY
-        since_ns = now_ns - life.spawned_ns
-        if 2 * waited_ns >= since_ns and since_ns < limits.start_most_s * 1e9:  # the host is overloaded
+        if now_ns - life.spawned_ns - used.waited_ns < limits.start_s * 1e9:
             return None
-    if life.state is State.RUNNING and quiet_ns >= limits.hang_s * 1e9:
-        overloaded = 2 * waited_ns >= quiet_ns and quiet_ns < limits.hang_most_s * 1e9
-        return None if overloaded else Event.HANG
+    if life.state is State.RUNNING and quiet_ns - used.waited_ns >= limits.hang_s * 1e9:
+        return Event.HANG
     if life.due_ns is not None and now_ns >= life.due_ns:
         return Event.ELAPSED
     return None

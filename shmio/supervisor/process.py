@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import shmio
-from shmio.realtime import waited_ns
+from shmio.realtime import ProcessorTime
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Environment variables that the service manager sets: sd_notify(3), sd_watchdog_enabled(3)."""
@@ -98,9 +98,9 @@ class ChildProcess:
         os.close(self.pidfd)
         return code
 
-    def waited_ns(self) -> int:
-        """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
-        return waited_ns(self.pid)
+    def processor_time(self) -> ProcessorTime:
+        """Return how long the threads of the process have run, and waited for a processor; 0 if unknown."""
+        return ProcessorTime.of(self.pid)
 
     def last_words(self) -> str:
         """Return the last line that the process left in its log file; empty if there is none."""
@@ -154,9 +154,9 @@ class AdoptedProcess:
         select.select([self.pidfd], [], [])
         os.close(self.pidfd)
 
-    def waited_ns(self) -> int:
-        """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
-        return waited_ns(self.pid)
+    def processor_time(self) -> ProcessorTime:
+        """Return how long the threads of the process have run, and waited for a processor; 0 if unknown."""
+        return ProcessorTime.of(self.pid)
 
     def last_words(self) -> str:
         """Return "", because it is unknown which lines of the log file are from this process."""

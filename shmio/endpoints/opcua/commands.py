@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from shmio.audit.trail import Attempt
@@ -35,22 +35,22 @@ class CommandClient:
         """Return whether the configuration allows clients to write all of a register, element or part."""
         return self._source_writer.is_writable(register)
 
-    async def write(self, register: Register, value: object, attempt: Attempt | None = None) -> End:
-        """Write a value, wait for the outcome, and return the outcome.
+    async def write(self, values: Mapping[Register, object], attempt: Attempt | None = None) -> End:
+        """Write values as one command, wait for the outcome, and return the outcome.
 
         Args:
-            register: The register, element or part.
-            value: The value.
+            values: The value of each register, element or part.
             attempt: The command's entry in the audit log; None if there is none.
 
         Raises:
             CommandError: The command was not sent.
-            ValueRangeError: The value does not fit the register. The command was not sent.
+            ValueRangeError: A value does not fit its register. The command was not sent.
 
         """
-        cost = CommandCost.of(sizes(register))
+        cost = CommandCost.of([size for register in values for size in sizes(register)])
         await self._await_room(cost)
-        return await self._sent(self._source_writer.submit({register.path: value}), cost, attempt)
+        by_path = {register.path: value for register, value in values.items()}
+        return await self._sent(self._source_writer.submit(by_path), cost, attempt)
 
     async def lift(self, injection: int) -> End:
         """Lift an injection, and return the outcome.

@@ -5,22 +5,35 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
+import time
+from collections import Counter
 from typing import Any, Final
 
 from asyncua import ua
+from asyncua.common.connection import MessageChunk
 from asyncua.common.utils import Buffer, NotEnoughData, ServiceError
 from asyncua.server.binary_server_asyncio import OPCUAProtocol
 from asyncua.server.uaprocessor import UaProcessor
-from asyncua.ua.ua_binary import header_from_binary, struct_from_binary, uatcp_to_binary
+from asyncua.ua.ua_binary import header_from_binary, uatcp_to_binary
 
 from shmio.audit import trail
 from shmio.audit.trail import Acting, Actor
+from shmio.endpoints.opcua.requests import SERVICES, Service, decode, encode
+from shmio.endpoints.opcua.shares import Share
 from shmio.logs import fields
 
 MAX_CONNECTIONS: Final = 100
+"""Maximum number of connections with an activated session."""
+MAX_PENDING: Final = 100
+"""Number of connections without an activated session, above which a new one replaces the oldest."""
 MAX_SESSIONS: Final = 100
+MAX_SMALL_BYTES: Final = 65_536
+"""Maximum size of a request that needs no activated session."""
+MAX_ACKNOWLEDGEMENTS: Final = 1_000
+"""Maximum number of acknowledgements in a Publish request."""
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 4 << 20
+MAX_CHUNKS: Final = MAX_MESSAGE_BYTES // MAX_CHUNK_BYTES + 1
 MAX_WAITING: Final = 32
 """Number of waiting messages above which the endpoint reads no more from the connection."""
 MAX_UNSENT_BYTES: Final = 1 << 20
@@ -41,16 +54,8 @@ _SESSIONS: Final = frozenset({
     _IDS.CloseSessionRequest_Encoding_DefaultBinary,
 })  # fmt: skip
 _SERVED: Final = frozenset({
-    _IDS.ReadRequest_Encoding_DefaultBinary, _IDS.WriteRequest_Encoding_DefaultBinary,
-    _IDS.BrowseRequest_Encoding_DefaultBinary, _IDS.BrowseNextRequest_Encoding_DefaultBinary,
-    _IDS.TranslateBrowsePathsToNodeIdsRequest_Encoding_DefaultBinary,
-    _IDS.RegisterNodesRequest_Encoding_DefaultBinary, _IDS.UnregisterNodesRequest_Encoding_DefaultBinary,
-    _IDS.CallRequest_Encoding_DefaultBinary,
+    *SERVICES,
     _IDS.CreateSubscriptionRequest_Encoding_DefaultBinary, _IDS.ModifySubscriptionRequest_Encoding_DefaultBinary,
-    _IDS.DeleteSubscriptionsRequest_Encoding_DefaultBinary, _IDS.TransferSubscriptionsRequest_Encoding_DefaultBinary,
-    _IDS.SetPublishingModeRequest_Encoding_DefaultBinary, _IDS.SetMonitoringModeRequest_Encoding_DefaultBinary,
-    _IDS.CreateMonitoredItemsRequest_Encoding_DefaultBinary, _IDS.ModifyMonitoredItemsRequest_Encoding_DefaultBinary,
-    _IDS.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
     _IDS.PublishRequest_Encoding_DefaultBinary, _IDS.RepublishRequest_Encoding_DefaultBinary,
 })  # fmt: skip
 """The services that a session may use. The endpoint refuses all others: some could change the address space."""
@@ -68,12 +73,21 @@ class Processor(UaProcessor):
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
+        self.share = Share(self.iserver.shares)
+        """The client's share of the endpoint's time."""
         self._pass = asyncio.Event()
         self._pass.set()
+        self._sending = False
+        """True while a response is being sent in several chunks, between which no other message may come."""
 
     def can_send(self) -> bool:
-        """Return whether messages can be sent: whether the connection is open, and the client reads."""
-        return self._pass.is_set() and not self._transport.is_closing()
+        """Return whether messages can be sent: whether the connection is open and free, and the client reads."""
+        return self._pass.is_set() and not self._sending and not self._transport.is_closing()
+
+    @property
+    def pending(self) -> bool:
+        """True if the client has not activated a session."""
+        return self.session is None or not self.session.is_activated()
 
     def pause(self) -> None:
         """Stop processing requests until :meth:`resume`."""
@@ -86,6 +100,46 @@ class Processor(UaProcessor):
     async def proceed(self) -> None:
         """Wait while processing is paused."""
         await self._pass.wait()
+
+    async def _respond(self, service: Service, requesthdr: Any, seqhdr: Any, body: Any) -> None:
+        """Serve a request whose parameters and results are arrays, in slices of the client's share of the time."""
+        session: Any = self.session
+        parameters = await decode(service.parameters, body, service.most, self.share)
+        results = await getattr(session, service.serve)(parameters)
+        header = ua.ResponseHeader(RequestHandle=requesthdr.RequestHandle)
+        await self._send(encode(service, header, results), seqhdr)
+
+    async def _send(self, message: bytes, seqhdr: Any) -> None:
+        """Send a response, and let other clients proceed between its chunks.
+
+        Raises:
+            ServiceError: The response is larger than the client allows.
+        """
+        connection, token = self._connection, self._connection.security_token
+        chunks = MessageChunk.message_to_chunks(
+            connection.security_policy, message, self._limits.max_send_buffer,
+            channel_id=token.ChannelId, request_id=seqhdr.RequestId, token_id=token.TokenId,
+        )  # fmt: skip
+        if not self._fits(len(message), len(chunks)):
+            raise ServiceError(Fault.BadResponseTooLarge)
+        self._sending = True
+        try:
+            for chunk in chunks:
+                connection._sequence_number = connection._sequence_number % 0xFFFFFFFF + 1
+                chunk.SequenceHeader.SequenceNumber = connection._sequence_number
+                self._transport.write(chunk.to_binary())
+                await self.proceed()
+                await self.share.turn()
+        finally:
+            self._sending = False
+
+    def _fits(self, size: int, chunks: int) -> bool:
+        """Return whether the client accepts a message. The limits of its Hello are known if they are below ours."""
+        limits = self._limits
+        bound_size, bound_chunks = limits.max_message_size, limits.max_chunk_count
+        return (size <= bound_size or bound_size == MAX_MESSAGE_BYTES) and (
+            chunks <= bound_chunks or bound_chunks == MAX_CHUNKS
+        )
 
     def publish(self, result: ua.PublishResult, request: Any) -> None:
         """Send a publication as the answer to a Publish request."""
@@ -126,6 +180,8 @@ class Processor(UaProcessor):
 
     async def _serve(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
         kind = typeid.Identifier if typeid.NamespaceIndex == 0 else None
+        if len(body) > MAX_SMALL_BYTES and kind not in SERVICES and kind != _IDS.PublishRequest_Encoding_DefaultBinary:
+            raise ServiceError(Fault.BadRequestTooLarge)
         if kind not in _WITHOUT_SESSION:
             # Every client may open a channel without security to ask which endpoints there are.
             if not self.encrypted and not self.iserver.plain_text:
@@ -143,14 +199,15 @@ class Processor(UaProcessor):
                 raise ServiceError(Fault.BadSessionNotActivated)
             if requesthdr.AuthenticationToken != session.auth_token:
                 raise ServiceError(Fault.BadSessionIdInvalid)
-            if kind == _IDS.BrowseNextRequest_Encoding_DefaultBinary:
+            if kind in SERVICES:
+                self.session_last_activity = time.monotonic()
                 session.touch()
-                response = ua.BrowseNextResponse()
-                response.Parameters.Results = session.browse_more(struct_from_binary(ua.BrowseNextParameters, body))
-                self.send_response(requesthdr.RequestHandle, seqhdr, response)
+                await self._respond(SERVICES[kind], requesthdr, seqhdr, body)
                 return True
-            if kind == _IDS.ModifyMonitoredItemsRequest_Encoding_DefaultBinary:
-                session.need("read")
+            if kind == _IDS.PublishRequest_Encoding_DefaultBinary:
+                (acknowledged,) = struct.unpack("<i", body.copy(4).read(4))
+                if acknowledged > MAX_ACKNOWLEDGEMENTS:
+                    raise ServiceError(Fault.BadTooManyOperations)
         return bool(await super()._process_message(typeid, requesthdr, seqhdr, body))
 
     async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
@@ -158,6 +215,7 @@ class Processor(UaProcessor):
         if session is None or session.auth_token != requesthdr.AuthenticationToken:
             raise ServiceError(Fault.BadSessionIdInvalid)
         session.trusted_channel = self.encrypted or self.iserver.loopback
+        session.share = self.share
         taken_over = self.session is None
         try:
             done = bool(await super()._process_message(typeid, requesthdr, seqhdr, body))
@@ -206,8 +264,14 @@ class Protocol(OPCUAProtocol):
         self._stuck: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Accept a connection, unless there are too many."""
+        """Accept a connection. If too many have no activated session, the oldest of these is closed."""
         counted: Any = _CountedTransport(transport, self.iserver.counters)
+        pending: list[Any] = [one for one in self.clients if one.processor is None or one.processor.pending]
+        if len(pending) >= MAX_PENDING:
+            hosts = Counter(one.peer_name[0] for one in pending)
+            (most, _), *_ = hosts.most_common(1)
+            oldest = next(one for one in pending if one.peer_name[0] == most)
+            oldest.drop("too many clients have connected without a session, and it is the oldest of its host")
         super().connection_made(counted)
         if self.transport is None:  # refused
             return
@@ -220,13 +284,14 @@ class Protocol(OPCUAProtocol):
         if self._stuck is not None:
             self._stuck.cancel()
         if self.transport is not None:
+            self.processor.share.close()
             super().connection_lost(ex)
 
     def pause_writing(self) -> None:
         """Stop processing a client's requests, because it does not read; disconnect it after ``STUCK_S``."""
         if self.processor is not None:
             self.processor.pause()
-        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._drop, "it does not read what it is sent")
+        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self.drop, "it does not read what it is sent")
 
     def resume_writing(self) -> None:
         """Process requests again, now that the client reads."""
@@ -243,7 +308,7 @@ class Protocol(OPCUAProtocol):
             kind, chunk, size = struct.unpack_from("<3scI", self._received)
             known = kind in _KINDS and chunk in (b"F", b"C", b"A") and (kind == b"HEL") != self._greeted
             if not known or not (12 if self._greeted else 8) < size <= MAX_CHUNK_BYTES:
-                self._drop("it sent data that is not OPC UA")
+                self.drop("it sent data that is not OPC UA")
                 return
             if len(self._received) < size:
                 return
@@ -264,8 +329,9 @@ class Protocol(OPCUAProtocol):
                 self._paused = False
                 self.transport.resume_reading()
             await self.processor.proceed()
+            await self.processor.share.wait()  # at least lets other connections proceed
             try:
-                if not await self.processor.process(header, message):
+                if not await self.processor.share.count(self.processor.process(header, message)):
                     break
             except ua.uaerrors.UaStatusCodeError as error:
                 self._fail(error.code)
@@ -277,7 +343,6 @@ class Protocol(OPCUAProtocol):
                 )  # fmt: skip
                 self._fail(Fault.BadTcpInternalError if header.MessageType == b"HEL" else Fault.BadDecodingError)
                 break
-            await asyncio.sleep(0)  # let other connections proceed
         if self.transport is not None:
             self.transport.close()
 
@@ -286,7 +351,8 @@ class Protocol(OPCUAProtocol):
         if self.transport is not None and not self.transport.is_closing():
             self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code), "")))
 
-    def _drop(self, why: str) -> None:
+    def drop(self, why: str) -> None:
+        """Disconnect the client at once. The log says why."""
         log.warning("a client was disconnected: %s", why, extra=fields(peer=str(self.peer_name)))
         self._received.clear()
         if self.transport is not None:

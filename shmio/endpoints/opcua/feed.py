@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Protocol
 
 from asyncua import ua
@@ -21,6 +21,8 @@ log = logging.getLogger("shmio.opcua")
 
 MAX_FRAMES_PER_TURN: Final = 8
 """Maximum number of frames that are read in one go, before the endpoint does other work."""
+MAX_ENCODED: Final = 20_000
+"""Maximum number of encoded values that are kept until the next frame."""
 CATCH_UP_S: Final = 3.0
 """If the endpoint is further behind than this time in s, or half of the ring, it skips to the newest frame."""
 
@@ -34,7 +36,40 @@ class Listener(Protocol):
     """True if the item queues several values, not only the newest."""
 
     def changed(self) -> None:
-        """Handle a change of the variable."""
+        """Handle a change of the variable. No other change is reported until the item is armed again."""
+
+
+class Readable(Protocol):
+    """A variable, or a part of its value."""
+
+    def value(self) -> ua.DataValue:
+        """Return the present value."""
+
+    def encoded(self) -> bytes:
+        """Return the present value, encoded."""
+
+
+class Changes:
+    """The changes of one register, and the watches of its value, its elements and its parts.
+
+    A change costs nothing for watches whose items have not sent their last value yet.
+    """
+
+    __slots__ = ("armed", "count", "watches")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.watches: dict[str, Watch] = {}
+        self.armed: dict[Watch, None] = {}
+        """The watches with items that wait for a change."""
+
+    def changed(self) -> None:
+        """Handle a change of the register: notify the watches."""
+        self.count += 1
+        if self.armed:
+            armed, self.armed = self.armed, {}
+            for watch in armed:
+                watch.notify()
 
 
 class Watch:
@@ -43,69 +78,106 @@ class Watch:
     A value is encoded once for all clients, when the first of them needs it.
     """
 
-    __slots__ = ("_encoded", "_get", "_value", "feed", "gone", "key", "listeners")
+    __slots__ = ("_armed", "_at", "_encoded", "_source", "changes", "feed", "gone", "index_range", "key", "listeners")
 
-    def __init__(self, feed: Feed, key: str, get: Callable[[], ua.DataValue]) -> None:
-        self.feed, self.key = feed, key
+    def __init__(
+        self, feed: Feed, key: str, source: Readable, changes: Changes | None = None, index_range: str = ""
+    ) -> None:
+        self.feed, self.key, self.index_range = feed, key, index_range
+        self.changes = Changes() if changes is None else changes
         self.gone = False
         """True if the variable no longer exists."""
         self.listeners: dict[Listener, None] = {}
-        self._get = get
-        self._value: ua.DataValue | None = None
-        self._encoded: bytes | None = None
+        self._armed: dict[Listener, None] = {}
+        self._source = source
+        self._encoded = b""
+        self._at = -1
+        """The number of changes before ``_encoded``."""
 
     def add(self, listener: Listener) -> None:
-        """Add a listener. From now on, it is notified of changes."""
+        """Add a listener, which is not armed yet."""
         self.listeners[listener] = None
         self.feed.count()
+
+    def arm(self, listener: Listener) -> None:
+        """Notify a listener of the next change."""
+        self._armed[listener] = None
+        self.changes.armed[self] = None
+        if listener.every:
+            self.feed.timed[listener] = self
+
+    def awaits(self, listener: Listener) -> bool:
+        """Return whether a listener is armed: whether no change has come since then."""
+        return listener in self._armed
 
     def remove(self, listener: Listener) -> None:
         """Remove a listener. The watch ends when its last listener is removed."""
         self.listeners.pop(listener, None)
+        self._armed.pop(listener, None)
+        self.feed.timed.pop(listener, None)
         if not self.listeners:
+            self.changes.armed.pop(self, None)
             self.feed.release(self)
         self.feed.count()
 
-    def renew(self, get: Callable[[], ua.DataValue] | None) -> None:
-        """Replace the function that returns the value, after a reload.
-
-        ``get`` is None if the variable no longer exists.
-        """
-        self.gone = get is None
-        self._get = _unknown if get is None else get
+    def renew(self, source: Readable | None) -> None:
+        """Replace the variable, after a reload. ``source`` is None if the variable no longer exists."""
+        self.gone = source is None
+        self._source = _UNKNOWN if source is None else source
+        self._at = -1
         self.changed()
 
     def changed(self) -> None:
-        """Handle a change of the value: notify the listeners."""
-        self.forget()
-        for listener in self.listeners:
+        """Handle a change of this variable alone."""
+        self.changes.count += 1
+        self.changes.armed.pop(self, None)
+        self.notify()
+
+    def notify(self) -> None:
+        """Notify the armed listeners."""
+        armed, self._armed = self._armed, {}
+        for listener in armed:
+            if listener.every:
+                self.feed.timed.pop(listener, None)
             listener.changed()
 
-    def forget(self) -> None:
-        """Discard the cached value and its encoding."""
-        self._value = self._encoded = None
+    def notify_of_time(self, listener: Listener) -> None:
+        """Notify a listener of a frame in which perhaps only the time has changed."""
+        self.changes.count += 1
+        if self._armed.pop(listener, self) is None:
+            listener.changed()
 
     def fetch(self) -> bytes:
         """Compute the present value anew, without the cache, and return it encoded."""
-        return struct_to_binary(self._get())
+        return self._source.encoded()
 
     @property
     def value(self) -> ua.DataValue:
-        """The present value. It is cached until it changes."""
-        if self._value is None:
-            self._value = self._get()
-        return self._value
+        """The present value."""
+        return self._source.value()
 
     @property
     def encoded(self) -> bytes:
         """The present value, encoded. It is cached until it changes."""
-        if self._encoded is None:
-            self._encoded = struct_to_binary(self.value)
+        if self._at != self.changes.count:
+            self._encoded = self._source.encoded()
+            self._at = self.changes.count
         return self._encoded
 
 
-def _unknown() -> ua.DataValue:
-    return ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNodeIdUnknown))
+class _Unknown:
+    """The variable that a reload has removed."""
+
+    def value(self) -> ua.DataValue:
+        """Return the status of a node that does not exist."""
+        return ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNodeIdUnknown))
+
+    def encoded(self) -> bytes:
+        """Return the status, encoded."""
+        return struct_to_binary(self.value())
+
+
+_UNKNOWN: Final = _Unknown()
 
 
 class Feed:
@@ -127,7 +199,7 @@ class Feed:
         """Interval in ns at which to poll even without a doorbell, because none rings when a frame becomes stale."""
         self._scan = _scan(block)
         self._index = {register.path: index for index, register in enumerate(block.layout.registers)}
-        self._by_register: dict[int, dict[str, Watch]] = {}
+        self._by_register: dict[int, Changes] = {}
         self._details: dict[str, Watch] = {}
         self._shown: dict[str, bytes] = {}
         self._injected: Sequence[Any] = ()
@@ -137,12 +209,18 @@ class Feed:
         self._counted = True
         self._patient = True
         """True if all clients need only the newest values."""
-        self._timed: list[tuple[Watch, Listener]] = []
+        self.timed: dict[Listener, Watch] = {}
+        """The armed items that also report frames in which only the time has changed."""
+        self._encoded: dict[str, bytes] = {}
+        """The encoded values of the newest frame that clients have read, by path."""
+        self._about: tuple[object, ...] = ()
+        """All that properties depend on, at the last frame."""
 
     @property
     def watches(self) -> list[Watch]:
         """All watches of this source."""
-        return [*(one for found in self._by_register.values() for one in found.values()), *self._details.values()]
+        registers = (one for found in self._by_register.values() for one in found.watches.values())
+        return [*registers, *self._details.values()]
 
     # ---- values ------------------------------------------------------------------------------------------------------
 
@@ -157,6 +235,17 @@ class Feed:
             values.moment(frame.source_ns) if frame is not None and frame.source_ns else None,
         )
 
+    def encoded(self, register: Register) -> bytes:
+        """Return what :meth:`data_value` returns, encoded. It is encoded once for all that read it."""
+        found = self._encoded.get(register.path)
+        if found is None:
+            state = values.register_state(self.follower, register, self.injected())
+            frame = self.follower.frame
+            found = values.encode(register, state, 0 if frame is None else frame.source_ns)
+            if len(self._encoded) < MAX_ENCODED:
+                self._encoded[register.path] = found
+        return found
+
     def injected(self) -> Sequence[Any]:
         """Return the present injections over ``/out``; none if the newest frame contains no injected value."""
         frame = self.follower.frame
@@ -170,51 +259,54 @@ class Feed:
 
     # ---- watches -----------------------------------------------------------------------------------------------------
 
-    def watch(self, path: str, get: Callable[[], ua.DataValue]) -> Watch:
+    def watch(self, path: str, source: Readable, index_range: str = "") -> Watch:
         """Return the watch of a register, an element or a part. Create it if there is none yet.
 
         Args:
             path: Path of the register, element or part.
-            get: Returns its value, for a new watch.
+            source: The variable, for a new watch.
+            index_range: The part of the value that ``source`` returns; "" for all of it.
         """
-        index = self._register_of(path)
-        found = self._by_register.setdefault(index, {})
-        if path not in found:
-            found[path] = Watch(self, f"{self.block.source}/{path}", get)
-        return found[path]
+        changes = self._by_register.setdefault(self._register_of(path), Changes())
+        name = path + "?" + index_range
+        if name not in changes.watches:
+            key = f"{self.block.source}/{path}"
+            changes.watches[name] = Watch(self, key, source, changes, index_range)
+        return changes.watches[name]
 
-    def watch_detail(self, key: str, get: Callable[[], ua.DataValue]) -> Watch:
+    def watch_detail(self, key: str, source: Readable) -> Watch:
         """Return the watch of a property. Create it if there is none yet.
 
         After each frame, the feed checks whether the property has changed.
 
         Args:
             key: Identifies the property.
-            get: Returns its value, for a new watch.
+            source: The property, for a new watch.
         """
         if key not in self._details:
-            self._details[key] = Watch(self, key, get)
+            self._details[key] = Watch(self, key, source)
             self._shown[key] = self._details[key].encoded
         return self._details[key]
 
-    def adopt(self, watch: Watch, path: str | None, get: Callable[[], ua.DataValue] | None) -> None:
+    def adopt(self, watch: Watch, path: str | None, source: Readable | None) -> None:
         """Take over a watch after a reload, usually from the feed that this feed replaces.
 
         Args:
             watch: The watch.
             path: Path of the register that it watches; None if it watches a property.
-            get: Returns the variable's value; None if the variable no longer exists.
+            source: The variable; None if it no longer exists.
 
         """
-        watch.feed = self
+        watch.feed, watch.changes = self, Changes()
         self.count()
-        if get is not None:
+        if source is not None:
             if path is None:
                 self._details[watch.key] = watch
             else:
-                self._by_register.setdefault(self._register_of(path), {})[path] = watch
-        watch.renew(get)
-        if get is not None and path is None:
+                watch.changes = self._by_register.setdefault(self._register_of(path), Changes())
+                watch.changes.watches[path + "?" + watch.index_range] = watch
+        watch.renew(source)
+        if source is not None and path is None:
             self._shown[watch.key] = watch.encoded
 
     def _register_of(self, path: str) -> int:
@@ -229,11 +321,10 @@ class Feed:
         if self._details.get(watch.key) is watch:
             del self._details[watch.key], self._shown[watch.key]
         elif "#" not in path and not watch.gone:
-            index = self._register_of(path)
-            found = self._by_register.get(index, {})
-            if found.get(path) is watch:
-                del found[path]
-                if not found:
+            index, name = self._register_of(path), path + "?" + watch.index_range
+            if watch.changes.watches.get(name) is watch:
+                del watch.changes.watches[name]
+                if not watch.changes.watches and self._by_register.get(index) is watch.changes:
                     del self._by_register[index]
 
     def count(self) -> None:
@@ -242,9 +333,7 @@ class Feed:
 
     def _count(self) -> None:
         self._counted = True
-        pairs = [(watch, one) for watch in self.watches for one in watch.listeners]
-        self._patient = not any(one.queues or one.every for _, one in pairs)
-        self._timed = [(watch, one) for watch, one in pairs if one.every]
+        self._patient = not any(one.queues or one.every for watch in self.watches for one in watch.listeners)
 
     # ---- frames ------------------------------------------------------------------------------------------------------
 
@@ -274,23 +363,27 @@ class Feed:
         other = old is None or (old.effective is None) != (frame.effective is None)
         other |= frame.effective is not None and sequence != self._shown_sequence
         self._shown_sequence = sequence
+        self._encoded.clear()
         if other or old is None or change is not QualityChange.NONE:
             self._mark_everything()
             return
         if follower.quality is not Quality.BAD and self._by_register:
             for index in self._scan.changed(old.image, frame.image):
-                for watch in tuple(self._by_register.get(index, _NONE).values()):
-                    watch.changed()
-            for watch, listener in self._timed:
-                watch.forget()
-                listener.changed()
-        if self._details:
+                if (changes := self._by_register.get(index)) is not None:
+                    changes.changed()
+            if self.timed:
+                timed, self.timed = self.timed, {}
+                for listener, watch in timed.items():
+                    watch.notify_of_time(listener)
+        about = (frame.provenance, follower.quality, follower.reason)
+        if self._details and about != self._about:
+            self._about = about
             self._mark_details()
 
     def _mark_everything(self) -> None:
-        for found in tuple(self._by_register.values()):
-            for watch in tuple(found.values()):
-                watch.changed()
+        self._encoded.clear()
+        for changes in tuple(self._by_register.values()):
+            changes.changed()
         self._mark_details()
 
     def _mark_details(self) -> None:
@@ -299,9 +392,6 @@ class Feed:
             if new != self._shown[key]:
                 self._shown[key] = new
                 watch.changed()
-
-
-_NONE: Final[dict[str, Watch]] = {}
 
 
 def _scan(block: Block) -> ChangeScan:

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from asyncua import ua
+from asyncua.ua.ua_binary import struct_to_binary
 
 from shmio.endpoints.opcua import values
-from shmio.endpoints.opcua.feed import Feed, Watch
+from shmio.endpoints.opcua.feed import Feed, Readable, Watch
 from shmio.layout.model import Register
-from shmio.layout.topic import decode_segment
+from shmio.layout.topic import decode_segment, encode_segment
 from shmio.local.reading import injected
 from shmio.segment import Provenance
 
@@ -35,6 +36,8 @@ class Node:
     type_definition = ua.ObjectIds.FolderType
     reference = ua.ObjectIds.Organizes
     """Type of the reference from the parent node to this node."""
+    name_space = NAMESPACE
+    """Index of the namespace of the browse name."""
 
     def __init__(self, node_id: ua.NodeId, name: str, parent: Node | None) -> None:
         self.id, self.name, self.parent = node_id, name, parent
@@ -55,7 +58,7 @@ class Node:
             ua.NodeId(self.reference if reference is None else reference),
             forward,
             self.id,
-            ua.QualifiedName(self.name, NAMESPACE),
+            ua.QualifiedName(self.name, self.name_space),
             ua.LocalizedText(self.name),
             self.node_class,
             ua.NodeId(self.type_definition) if self.type_definition else ua.NodeId(),
@@ -65,6 +68,22 @@ class Node:
         """Yield the references from this node."""
         for child in self.all_children():
             yield child.description()
+        yield from self._other_references()
+
+    def references_named(self, name: str) -> Iterator[ua.ReferenceDescription]:
+        """Yield the references from this node, of those to nodes below it only the ones with this name."""
+        for child in self.named(name):
+            yield child.description()
+        yield from self._other_references()
+
+    def named(self, name: str) -> Iterator[Node]:
+        """Yield the nodes with this name directly below this one."""
+        for key in (encode_segment(name), f"#{name}"):
+            if key in self.children:
+                yield self.children[key]
+
+    def _other_references(self) -> Iterator[ua.ReferenceDescription]:
+        """Yield the references to the node above this one, and to its type."""
         if self.parent is not None:
             yield self.parent.description(forward=False, reference=self.reference)
         else:
@@ -94,7 +113,7 @@ class Node:
             case _Ids.NodeClass:
                 return ua.Variant(self.node_class, _Types.Int32)
             case _Ids.BrowseName:
-                return ua.Variant(ua.QualifiedName(self.name, NAMESPACE), _Types.QualifiedName)
+                return ua.Variant(ua.QualifiedName(self.name, self.name_space), _Types.QualifiedName)
             case _Ids.DisplayName:
                 return ua.Variant(ua.LocalizedText(self.name), _Types.LocalizedText)
             case _Ids.Description:
@@ -127,6 +146,10 @@ class VariableNode(Node):
     def value(self) -> ua.DataValue:
         """Return the present value."""
         raise NotImplementedError
+
+    def encoded(self) -> bytes:
+        """Return the present value, encoded."""
+        return struct_to_binary(self.value())
 
     def watch(self) -> Watch | None:
         """Return the watch of the variable's changes; None if its value never changes."""
@@ -162,6 +185,12 @@ class RegisterNode(VariableNode):
         self.feed, self.register = feed, register
 
     @property
+    def type_definition(self) -> int:
+        """The type of the variable: of a number with a unit and no range, or any (OPC 10000-8, section 5.3.2)."""
+        analog = self.register.unit and values.is_number(self.register)
+        return ua.ObjectIds.AnalogUnitType if analog else ua.ObjectIds.BaseDataVariableType
+
+    @property
     def data_type(self) -> ua.NodeId:  # a property here, an attribute in other classes
         """Data type of the register's value, or of its elements."""
         return ua.NodeId(values.data_type(self.register).value)
@@ -190,9 +219,13 @@ class RegisterNode(VariableNode):
         """Return the present value, with status and source time."""
         return self.feed.data_value(self.register)
 
+    def encoded(self) -> bytes:
+        """Return the present value, encoded. It is encoded once for all that read it."""
+        return self.feed.encoded(self.register)
+
     def watch(self) -> Watch:
         """Return the watch of the register's changes."""
-        return self.feed.watch(self.register.path, self.value)
+        return self.feed.watch(self.register.path, self)
 
     def all_children(self) -> Iterator[Node]:
         """Yield the properties of the register."""
@@ -201,10 +234,20 @@ class RegisterNode(VariableNode):
             if name != UNIT or self.register.unit:
                 yield make(self, name)
 
+    def named(self, name: str) -> Iterator[Node]:
+        """Yield the nodes with this name directly below this one."""
+        yield from super().named(name)
+        if (found := self.property_named(name)) is not None:
+            yield found
+
     def property_named(self, name: str) -> Node | None:
         """Return the property with this name; None if there is none."""
         make = PROPERTIES.get(name)
         return None if make is None or (name == UNIT and not self.register.unit) else make(self, name)
+
+
+STANDARD: Final = frozenset({"EngineeringUnits", "InputArguments", "OutputArguments"})
+"""The properties that the standard defines. Their browse names are in its namespace."""
 
 
 class Property(VariableNode):
@@ -219,9 +262,11 @@ class Property(VariableNode):
         name: str,
         data_type: int,
         get: Callable[[], ua.Variant],
-        watch: Callable[[str, Callable[[], ua.DataValue]], Watch] | None = None,
+        watch: Callable[[str, Readable], Watch] | None = None,
     ) -> None:
         super().__init__(child_id(owner, name), name, owner)
+        if name in STANDARD:
+            self.name_space = 0
         self.data_type = ua.NodeId(data_type)
         self._get, self._watch = get, watch
 
@@ -231,7 +276,7 @@ class Property(VariableNode):
 
     def watch(self) -> Watch | None:
         """Return the watch of the property's changes; None if its value never changes."""
-        return None if self._watch is None else self._watch(str(self.id.Identifier), self.value)
+        return None if self._watch is None else self._watch(str(self.id.Identifier), self)
 
 
 UNIT: Final = "EngineeringUnits"
@@ -292,12 +337,17 @@ class Method(Node):
             if (found := self.property_named(name)) is not None:
                 yield found
 
+    def named(self, name: str) -> Iterator[Node]:
+        """Yield the property with this name."""
+        if (found := self.property_named(name)) is not None:
+            yield found
+
     def property_named(self, name: str) -> Node | None:
         """Return the property that describes the input or output arguments; None if there is none with this name."""
         arguments = {"InputArguments": self.inputs, "OutputArguments": self.outputs}.get(name)
         if not arguments:
             return None
-        found = _Arguments(
+        found = Property(
             self, name, ua.ObjectIds.Argument, lambda: ua.Variant(arguments, _Types.ExtensionObject, is_array=True)
         )
         found.sizes = [len(arguments)]
@@ -309,20 +359,6 @@ class Method(Node):
         if attribute == _Ids.UserExecutable:
             return ua.Variant(self.role in roles, _Types.Boolean)
         return None
-
-
-class _Arguments(Property):
-    """The property that describes a method's arguments. Its browse name is in the standard's namespace."""
-
-    def description(self, *, forward: bool = True, reference: int | None = None) -> ua.ReferenceDescription:
-        found = super().description(forward=forward, reference=reference)
-        found.BrowseName = ua.QualifiedName(self.name, 0)
-        return found
-
-    def _attribute(self, attribute: int, roles: Roles) -> ua.Variant | ua.DataValue | None:
-        if attribute == _Ids.BrowseName:
-            return ua.Variant(ua.QualifiedName(self.name, 0), _Types.QualifiedName)
-        return super()._attribute(attribute, roles)
 
 
 class SourceNode(Node):

@@ -26,12 +26,16 @@ from shmio.endpoints.opcua.certificates import application_uri, read_identity
 from shmio.endpoints.opcua.connection import (
     ACTIVATION_S,
     MAX_CHUNK_BYTES,
+    MAX_CHUNKS,
     MAX_CONNECTIONS,
     MAX_MESSAGE_BYTES,
+    MAX_PENDING,
     MAX_SESSIONS,
     Protocol,
 )
-from shmio.endpoints.opcua.session import MAX_CALLS, MAX_NODES, MAX_WRITES, Session
+from shmio.endpoints.opcua.requests import MAX_CALLS, MAX_NODES, MAX_WRITES
+from shmio.endpoints.opcua.session import Session
+from shmio.endpoints.opcua.shares import Shares
 from shmio.endpoints.opcua.space import Space
 from shmio.endpoints.opcua.subscriptions import Subscriptions
 from shmio.errors import EndpointError
@@ -77,6 +81,7 @@ class InternalServer(LibraryInternalServer):
     def __init__(self, instance: str, access: Access, address: Address, *, plain_text: bool) -> None:
         self.counters = Counters()
         self.subscriptions = Subscriptions()
+        self.shares = Shares()
         self.access = access
         self.loopback = address.loopback
         self.plain_text = plain_text
@@ -87,7 +92,7 @@ class InternalServer(LibraryInternalServer):
         super().__init__(user_manager=self)
         self.instance = instance
         self.allow_remote_admin = False
-        self.max_connections = MAX_CONNECTIONS
+        self.max_connections = MAX_CONNECTIONS + MAX_PENDING
         self.max_pending_activation_seconds = ACTIVATION_S
         self.max_session_timeout_ms = 300_000
 
@@ -207,9 +212,7 @@ class Server(Library):
         self.set_identity_tokens(tokens or [ua.AnonymousIdentityToken])
         host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
         self.set_endpoint(f"opc.tcp://{host}:{self.address.port}/")
-        self.limits = TransportLimits(
-            MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_MESSAGE_BYTES // MAX_CHUNK_BYTES + 1, MAX_MESSAGE_BYTES
-        )
+        self.limits = TransportLimits(MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_CHUNKS, MAX_MESSAGE_BYTES)
 
     async def init(self, shelf_file: Any = None) -> None:
         """Create the nodes of the OPC UA standard. Set the namespace, the build info and the limits."""

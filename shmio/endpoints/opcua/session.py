@@ -5,37 +5,35 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Iterable
+import struct
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
 from typing import Any, Final
 
 from asyncua import ua
 from asyncua.common.utils import ServiceError
 from asyncua.server.internal_session import InternalSession
+from asyncua.ua.ua_binary import Primitives, nodeid_to_binary, struct_to_binary
 
 from shmio.audit import trail
 from shmio.audit.trail import Actor
 from shmio.endpoints.opcua.access import User
 from shmio.endpoints.opcua.nodes import Method, RegisterNode, bad
+from shmio.endpoints.opcua.parts import plain, registers_of_part
+from shmio.endpoints.opcua.shares import Share
 from shmio.endpoints.opcua.subscriptions import Subscription
-from shmio.endpoints.opcua.values import data_type
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
+from shmio.model.opcua_parts import read_part
 from shmio.segment import DONE, EventKind
 
-MAX_NODES: Final = 10_000
-"""Maximum number of nodes, items or paths in a request. The server's OperationLimits contain this number."""
-MAX_WRITES: Final = 1_000
-MAX_CALLS: Final = 10
 MAX_RESPONSE_BYTES: Final = 8 << 20
 """Approximate maximum size of the values in a response to Read."""
 MAX_REFERENCES: Final = 20_000
 """Maximum number of references in a response to Browse. BrowseNext returns further ones."""
 MAX_CONTINUATIONS: Final = 20
 """Maximum number of continuation points of a session."""
-TURN: Final = 500
-"""Number of nodes after which a request lets other tasks run."""
 
 _OUTCOMES: Final = {
     EventKind.REJECTED: ua.StatusCodes.BadRequestNotAllowed,
@@ -58,6 +56,8 @@ class Session(InternalSession):
 
     iserver: Any  # InternalServer of the module server, which imports this one
     user: Any
+    share: Share
+    """The client's share of the endpoint's time."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
@@ -129,116 +129,139 @@ class Session(InternalSession):
 
     # ---- reading -----------------------------------------------------------------------------------------------------
 
-    async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
+    async def serve_read(self, params: ua.ReadParameters) -> list[bytes]:
         """Return attributes of nodes."""
-        if not self.external:
-            return await super().read(params)
         self.need("read")
-        _bound(params.NodesToRead, MAX_NODES)
+        _check_not_empty(params.NodesToRead)
         if not params.MaxAge >= 0:
             raise ServiceError(Fault.BadMaxAgeInvalid)
+        if params.TimestampsToReturn not in _TIMESTAMPS:
+            raise ServiceError(Fault.BadTimestampsToReturnInvalid)
         self.iserver.catch_up()
         found, size = [], 0
-        for number, asked in enumerate(params.NodesToRead):
-            if number % TURN == TURN - 1:
-                await asyncio.sleep(0)
+        for asked in params.NodesToRead:
             value = self._read(asked)
-            size += _size(value)
+            size += len(value)
             if size > MAX_RESPONSE_BYTES:
                 raise ServiceError(Fault.BadResponseTooLarge)
             found.append(value)
+            await self.share.turn()
         return found
 
-    def _read(self, asked: ua.ReadValueId) -> ua.DataValue:
-        value = self.iserver.space.read(asked.NodeId, asked.AttributeId, self.roles)
+    def _read(self, asked: ua.ReadValueId) -> bytes:
+        node = self.iserver.space.find(asked.NodeId)
         if asked.DataEncoding is not None and asked.DataEncoding.Name not in (None, "", "Default Binary"):
-            return bad(Fault.BadDataEncodingUnsupported)
-        return _part(value, asked.IndexRange) if asked.IndexRange else value
+            return struct_to_binary(bad(Fault.BadDataEncodingUnsupported))
+        if asked.IndexRange:
+            value = self.iserver.space.read(asked.NodeId, asked.AttributeId, self.roles)
+            return struct_to_binary(read_part(value, asked.IndexRange))
+        if isinstance(node, RegisterNode) and asked.AttributeId == ua.AttributeIds.Value:
+            return node.encoded()
+        value = self.iserver.space.read(asked.NodeId, asked.AttributeId, self.roles)
+        try:
+            return struct_to_binary(value)
+        except (ua.UaError, ValueError) as error:
+            log.warning("an attribute of %s cannot be sent: %s", asked.NodeId, error)
+            return struct_to_binary(bad(Fault.BadEncodingError))
 
-    async def browse(self, params: ua.BrowseParameters) -> list[ua.BrowseResult]:
+    async def serve_browse(self, params: ua.BrowseParameters) -> list[bytes]:
         """Return the references from nodes."""
-        if not self.external:
-            return await super().browse(params)
         self.need("read")
-        _bound(params.NodesToBrowse, MAX_NODES)
+        _check_not_empty(params.NodesToBrowse)
         room, results = MAX_REFERENCES, []
-        for number, asked in enumerate(params.NodesToBrowse):
-            if number % TURN == TURN - 1:
-                await asyncio.sleep(0)
-            references = self.iserver.space.browse(asked)
-            if references is None:
-                results.append(ua.BrowseResult(ua.StatusCode(Fault.BadNodeIdUnknown)))
-                continue
-            most = min(params.RequestedMaxReferencesPerNode or MAX_REFERENCES, MAX_REFERENCES)
-            result = self._portion(references, most, room)
-            room -= len(result.References)
-            results.append(result)
+        most = min(params.RequestedMaxReferencesPerNode or MAX_REFERENCES, MAX_REFERENCES)
+        for asked in params.NodesToBrowse:
+            if asked.BrowseDirection not in _DIRECTIONS:
+                results.append(_no_references(Fault.BadBrowseDirectionInvalid))
+            elif (references := self.iserver.space.browse(asked)) is None:
+                results.append(_no_references(Fault.BadNodeIdUnknown))
+            else:
+                result, taken = await self._portion(references, most, room)
+                room -= taken
+                results.append(result)
+            await self.share.turn()
         return results
 
-    def browse_more(self, params: ua.BrowseNextParameters) -> list[ua.BrowseResult]:
+    async def serve_browse_next(self, params: ua.BrowseNextParameters) -> list[bytes]:
         """Return further references. If the client releases the continuation points, discard them instead."""
         self.need("read")
-        _bound(params.ContinuationPoints, MAX_NODES)
+        _check_not_empty(params.ContinuationPoints)
         room, results = MAX_REFERENCES, []
         for point in params.ContinuationPoints:
             found = self._continuations.pop(point or b"", None)
             if found is None:
-                results.append(ua.BrowseResult(ua.StatusCode(Fault.BadContinuationPointInvalid)))
+                results.append(_no_references(Fault.BadContinuationPointInvalid))
             elif params.ReleaseContinuationPoints:
-                results.append(ua.BrowseResult(ua.StatusCode()))
+                results.append(_no_references(Fault.Good))
             else:
-                results.append(self._portion(found[0], found[1], room))
-                room -= len(results[-1].References)
+                result, taken = await self._portion(found[0], found[1], room)
+                room -= taken
+                results.append(result)
+            await self.share.turn()
         return results
 
-    def _portion(self, references: Any, most: int, room: int) -> ua.BrowseResult:
-        """Return as many references as fit. A continuation point holds the rest."""
-        found = list(islice(references, min(most, room)))
-        result = ua.BrowseResult(ua.StatusCode(), None, found)
-        following = next(references, None)
-        if following is None:
-            return result
-        if len(self._continuations) >= MAX_CONTINUATIONS:
-            return ua.BrowseResult(ua.StatusCode(Fault.BadNoContinuationPoints))
-        result.ContinuationPoint = secrets.token_bytes(8)
-        self._continuations[result.ContinuationPoint] = _joined(following, references), most
-        return result
+    async def _portion(self, references: Any, most: int, room: int) -> tuple[bytes, int]:
+        """Return as many references as fit, and their number. A continuation point holds the rest."""
+        found: list[bytes] = []
+        most_now, following = min(most, room), None
+        for reference in references:
+            if reference is not None and len(found) >= most_now:
+                following = reference
+                break
+            if reference is not None:  # None: one that the client does not want
+                found.append(struct_to_binary(reference))
+            await self.share.turn()
+        point = None
+        if following is not None:
+            if len(self._continuations) >= MAX_CONTINUATIONS:
+                return _no_references(Fault.BadNoContinuationPoints), 0
+            point = secrets.token_bytes(8)
+            self._continuations[point] = _joined(following, references), most
+        head = struct_to_binary(ua.StatusCode()) + Primitives.ByteString.pack(point)
+        return b"".join((head, Primitives.Int32.pack(len(found)), *found)), len(found)
 
-    async def translate_browsepaths_to_nodeids(self, params: list[ua.BrowsePath]) -> list[ua.BrowsePathResult]:
+    async def serve_paths(self, params: ua.TranslateBrowsePathsToNodeIdsParameters) -> list[bytes]:
         """Return the nodes at the end of each path of browse names."""
-        if not self.external:
-            return await super().translate_browsepaths_to_nodeids(params)
         self.need("read")
-        _bound(params, MAX_NODES)
+        _check_not_empty(params.BrowsePaths)
         results = []
-        for number, path in enumerate(params):
-            if number % TURN == TURN - 1:
-                await asyncio.sleep(0)
+        for path in params.BrowsePaths:
             result = ua.BrowsePathResult()
             try:
-                found = self.iserver.space.follow(path.StartingNode, path.RelativePath.Elements)
+                found = await self.iserver.space.follow(path.StartingNode, path.RelativePath.Elements, self.share)
                 if not found:
                     raise ServiceError(Fault.BadNoMatch)
                 result.Targets = [ua.BrowsePathTarget(node, ua.Index(0xFFFFFFFF)) for node in found]
             except ServiceError as error:
                 result.StatusCode = ua.StatusCode(error.code)
-            results.append(result)
+            results.append(struct_to_binary(result))
+            await self.share.turn()
         return results
+
+    async def serve_register(self, params: ua.RegisterNodesParameters) -> list[bytes]:
+        """Return the same node ids, since registration makes nothing faster here."""
+        self.need("read")
+        _check_not_empty(params.NodesToRegister)
+        return [nodeid_to_binary(one) for one in params.NodesToRegister]
+
+    async def serve_unregister(self, params: ua.UnregisterNodesParameters) -> list[bytes]:
+        """Do nothing, since registration has done nothing."""
+        self.need("read")
+        _check_not_empty(params.NodesToUnregister)
+        return []
 
     # ---- writing and calling -----------------------------------------------------------------------------------------
 
-    async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
+    async def serve_write(self, params: ua.WriteParameters) -> list[bytes]:
         """Write registers. Each write is a command to its source, and its status is the command's outcome."""
-        if not self.external:
-            return await super().write(params)
         self.need("write", "write", _first_values(params.NodesToWrite))
-        _bound(params.NodesToWrite, MAX_WRITES)
+        _check_not_empty(params.NodesToWrite)
         with trail.acting(self.actor, "opcua"):
             codes = await asyncio.gather(*(self._write(asked) for asked in params.NodesToWrite))
         counters = self.iserver.counters
         counters.writes += len(codes)
         counters.refused += sum(code != Fault.Good for code in codes)
-        return [ua.StatusCode(code) for code in codes]
+        return [_STATUS.pack(code) for code in codes]
 
     async def _write(self, asked: ua.WriteValue) -> int:
         """Write one register, and return its status."""
@@ -253,18 +276,25 @@ class Session(InternalSession):
         node = self.iserver.space.find(asked.NodeId)
         if node is None:
             return Fault.BadNotWritable if self.iserver.space.knows(asked.NodeId) else Fault.BadNodeIdUnknown
-        if asked.AttributeId != ua.AttributeIds.Value or not isinstance(node, RegisterNode) or not node.writable:
+        if asked.AttributeId != ua.AttributeIds.Value or not isinstance(node, RegisterNode):
             return Fault.BadNotWritable
-        if asked.IndexRange:
-            return Fault.BadWriteNotSupported  # elements have nodes of their own
         status = asked.Value.StatusCode
         if status is not None and status.value != Fault.Good:
             return Fault.BadWriteNotSupported
-        value = _plain(asked.Value.Value, node.register)
-        if value is None:
+        given: Mapping[Register, Any]
+        if asked.IndexRange:
+            try:
+                given = registers_of_part(node, asked.IndexRange, asked.Value.Value)
+            except ServiceError as error:
+                return error.code
+        else:
+            given = {node.register: plain(asked.Value.Value, node.register)}
+        if not all(map(node.feed.commands.is_writable, given)):
+            return Fault.BadNotWritable
+        if None in given.values():
             return Fault.BadTypeMismatch
         try:
-            kind, reason = await node.feed.commands.write(node.register, value, attempt)
+            kind, reason = await node.feed.commands.write(given, attempt)
         except ValueRangeError as error:
             log.info("a client's value was not written: %s", shorten(str(error)))
             attempt.end("refused", str(error))
@@ -279,11 +309,11 @@ class Session(InternalSession):
         log.warning("the write to %s was not carried out: %s: %s", shorten(path, 400), kind, reason)
         return _OUTCOMES.get(kind, Fault.BadUnexpectedError)
 
-    async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
+    async def serve_call(self, params: ua.CallParameters) -> list[bytes]:
         """Call methods."""
-        _bound(params, MAX_CALLS)
+        _check_not_empty(params.MethodsToCall)
         with trail.acting(self.actor, "opcua"):
-            return [await self._call(asked) for asked in params]
+            return [struct_to_binary(await self._call(asked)) for asked in params.MethodsToCall]
 
     async def _call(self, asked: ua.CallMethodRequest) -> ua.CallMethodResult:
         result = ua.CallMethodResult()
@@ -341,7 +371,7 @@ class Session(InternalSession):
             request_callback: Returns a waiting Publish request.
         """
         found.pub_result_callback, found.pub_request_callback = callback, request_callback
-        found.can_send = callback.__self__.can_send
+        found.can_send, found.share = callback.__self__.can_send, self.share
 
     def sent(self, result: ua.PublishResult, request: Any, subscription: Subscription) -> None:
         """Send a publication of a subscription, as the answer to a Publish request."""
@@ -353,31 +383,38 @@ class Session(InternalSession):
         found.revise(params)
         return ua.ModifySubscriptionResult(found.interval_ms, found.lifetime, found.keep_alive)
 
-    async def set_publishing_mode(self, params: ua.SetPublishingModeParameters) -> list[ua.StatusCode]:
+    async def serve_publishing_mode(self, params: ua.SetPublishingModeParameters) -> list[bytes]:
         """Switch the publishing of subscriptions on or off."""
-        _bound(params.SubscriptionIds, MAX_NODES)
 
         def switch(number: int) -> None:
             self.iserver.subscriptions.find(number, self).enabled = bool(params.PublishingEnabled)
 
-        return [_status(switch, number) for number in params.SubscriptionIds]
+        return await self._each(params.SubscriptionIds, switch)
 
-    async def delete_subscriptions(self, ids: list[int]) -> list[ua.StatusCode]:
+    async def _each(self, numbers: list[int], do: Callable[[int], object]) -> list[bytes]:
+        """Do something with each number of a request, and return the statuses."""
+        _check_not_empty(numbers)
+        found = []
+        for number in numbers:
+            try:
+                do(number)
+            except ServiceError as error:
+                found.append(_STATUS.pack(error.code))
+            else:
+                found.append(_STATUS.pack(Fault.Good))
+            await self.share.turn()
+        return found
+
+    async def serve_delete_subscriptions(self, params: ua.DeleteSubscriptionsParameters) -> list[bytes]:
         """End subscriptions."""
-        if not self.external:
-            return await super().delete_subscriptions(ids)
-        _bound(ids, MAX_NODES)
         own = self.iserver.subscriptions
-        return [_status(lambda number: own.delete([own.find(number, self)]), number) for number in ids]
+        return await self._each(params.SubscriptionIds, lambda number: own.delete([own.find(number, self)]))
 
-    async def transfer_subscriptions(
-        self,
-        params: ua.TransferSubscriptionsParameters,
-        callback: Callable[..., Any],  # noqa: ARG002
-    ) -> list[ua.TransferResult]:
+    async def serve_transfer(self, params: ua.TransferSubscriptionsParameters) -> list[bytes]:
         """Refuse the transfer, because no session may take over the subscriptions of another session."""
-        _bound(params.SubscriptionIds, MAX_NODES)
-        return [ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)) for _ in params.SubscriptionIds]
+        _check_not_empty(params.SubscriptionIds)
+        refused = struct_to_binary(ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)))
+        return [refused] * len(params.SubscriptionIds)
 
     def publish(self, acks: Iterable[ua.SubscriptionAcknowledgement] | None = None) -> tuple[int, list[ua.StatusCode]]:
         """Process a Publish request's acknowledgements.
@@ -406,59 +443,71 @@ class Session(InternalSession):
         """Return an unacknowledged message, so that it is sent again."""
         return self.iserver.subscriptions.find(params.SubscriptionId, self).republish(params.RetransmitSequenceNumber)
 
-    async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> list[Any]:
+    async def serve_create_items(self, params: ua.CreateMonitoredItemsParameters) -> list[bytes]:
         """Start to monitor variables."""
         self.need("read")
-        _bound(params.ItemsToCreate, MAX_NODES)
+        _check_not_empty(params.ItemsToCreate)
+        if params.TimestampsToReturn not in _TIMESTAMPS:
+            raise ServiceError(Fault.BadTimestampsToReturnInvalid)
         self.iserver.catch_up()
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
-        room, results = self.iserver.subscriptions.room(self), list[Any]()
-        for number, asked in enumerate(params.ItemsToCreate):
-            if number % TURN == TURN - 1:
-                await asyncio.sleep(0)
+        results = []
+        for asked in params.ItemsToCreate:
             try:
-                if room <= 0:
-                    raise ServiceError(Fault.BadTooManyMonitoredItems)
-                target = asked.ItemToMonitor
-                if target.AttributeId == ua.AttributeIds.EventNotifier:
-                    raise ServiceError(Fault.BadServiceUnsupported)  # there are no events
-                if target.IndexRange:
-                    raise ServiceError(Fault.BadIndexRangeInvalid)  # elements have nodes of their own
-                watch, fastest_ms = self.iserver.space.watch(target.NodeId, target.AttributeId, self.roles)
-                results.append(found.add(watch, asked, fastest_ms))
-                room -= 1
+                result = self._create_item(found, asked, len(params.ItemsToCreate))
             except ServiceError as error:
-                results.append(ua.MonitoredItemCreateResult(ua.StatusCode(error.code)))
+                result = ua.MonitoredItemCreateResult(ua.StatusCode(error.code))
+            results.append(struct_to_binary(result))
+            await self.share.turn()
         return results
 
-    async def modify_monitored_items(self, params: ua.ModifyMonitoredItemsParameters) -> list[Any]:
+    def _create_item(
+        self, found: Subscription, asked: ua.MonitoredItemCreateRequest, companions: int
+    ) -> ua.MonitoredItemCreateResult:
+        target = asked.ItemToMonitor
+        if self.iserver.subscriptions.room(self) <= 0:
+            raise ServiceError(Fault.BadTooManyMonitoredItems)
+        if asked.MonitoringMode not in _MODES:
+            raise ServiceError(Fault.BadMonitoringModeInvalid)
+        if target.AttributeId == ua.AttributeIds.EventNotifier:
+            raise ServiceError(Fault.BadServiceUnsupported)  # there are no events
+        space = self.iserver.space
+        watch, fastest_ms = space.watch(target.NodeId, target.AttributeId, self.roles, target.IndexRange or "")
+        return found.add(watch, asked, fastest_ms, companions)
+
+    async def serve_modify_items(self, params: ua.ModifyMonitoredItemsParameters) -> list[bytes]:
         """Change the parameters of monitored items."""
-        _bound(params.ItemsToModify, MAX_NODES)
+        self.need("read")
+        _check_not_empty(params.ItemsToModify)
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
-        results = list[Any]()
+        results = []
         for asked in params.ItemsToModify:
             try:
-                results.append(found.modify(asked, 0.0))
+                result = found.modify(asked)
             except ServiceError as error:
-                results.append(ua.MonitoredItemModifyResult(ua.StatusCode(error.code)))
+                result = ua.MonitoredItemModifyResult(ua.StatusCode(error.code))
+            results.append(struct_to_binary(result))
+            await self.share.turn()
         return results
 
-    async def set_monitoring_mode(self, params: ua.SetMonitoringModeParameters) -> list[ua.StatusCode]:
+    async def serve_monitoring_mode(self, params: ua.SetMonitoringModeParameters) -> list[bytes]:
         """Change the monitoring mode of items."""
-        _bound(params.MonitoredItemIds, MAX_NODES)
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
+        if params.MonitoringMode not in _MODES:
+            raise ServiceError(Fault.BadMonitoringModeInvalid)
         mode = ua.MonitoringMode(params.MonitoringMode)
-        return [_status(lambda number: found.set_mode(number, mode), number) for number in params.MonitoredItemIds]
+        return await self._each(params.MonitoredItemIds, lambda number: found.set_mode(number, mode))
 
-    async def delete_monitored_items(self, params: ua.DeleteMonitoredItemsParameters) -> list[ua.StatusCode]:
+    async def serve_delete_items(self, params: ua.DeleteMonitoredItemsParameters) -> list[bytes]:
         """Stop monitoring variables."""
-        _bound(params.MonitoredItemIds, MAX_ITEMS_PER_REQUEST)
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
-        return [_status(found.remove, number) for number in params.MonitoredItemIds]
+        return await self._each(params.MonitoredItemIds, found.remove)
 
 
-MAX_ITEMS_PER_REQUEST: Final = 50_000
-"""Maximum number of items that one request may delete. It is the number that a session can have."""
+_STATUS: Final = struct.Struct("<I")
+_TIMESTAMPS: Final = frozenset(ua.TimestampsToReturn) - {ua.TimestampsToReturn.Invalid}
+_DIRECTIONS: Final = frozenset(ua.BrowseDirection) - {ua.BrowseDirection.Invalid}
+_MODES: Final = frozenset(ua.MonitoringMode)
 
 
 def _value(asked: ua.WriteValue) -> Any:
@@ -470,69 +519,16 @@ def _first_values(asked: Iterable[ua.WriteValue] | None) -> dict[str, Any]:
     return {str(one.NodeId.Identifier): _value(one) for one in islice(asked or (), trail.MAX_NAMED)}
 
 
-def _bound(asked: list[Any] | None, most: int) -> None:
-    """Raise ServiceError if a request has no items, or too many."""
+def _check_not_empty(asked: list[Any] | None) -> None:
+    """Raise ServiceError if a request has no items."""
     if not asked:
         raise ServiceError(Fault.BadNothingToDo)
-    if len(asked) > most:
-        raise ServiceError(Fault.BadTooManyOperations)
 
 
-def _status(do: Callable[[int], object], number: int) -> ua.StatusCode:
-    try:
-        do(number)
-    except ServiceError as error:
-        return ua.StatusCode(error.code)
-    return ua.StatusCode()
+def _no_references(code: int) -> bytes:
+    return struct_to_binary(ua.BrowseResult(ua.StatusCode(code)))
 
 
 def _joined(first: Any, rest: Any) -> Any:
     yield first
     yield from rest
-
-
-def _size(value: ua.DataValue) -> int:
-    """Return the approximate size of a value in bytes."""
-    content = None if value.Value is None else value.Value.Value
-    if not isinstance(content, list | str | bytes):
-        return 32
-    return 32 + _length(content, 1 if value.Value.VariantType in _BYTES else 8)
-
-
-_BYTES: Final = (ua.VariantType.Boolean, ua.VariantType.Byte, ua.VariantType.SByte)
-
-
-def _length(content: Any, element: int) -> int:
-    if isinstance(content, list):
-        nested = content and isinstance(content[0], list | str | bytes)
-        return sum(_length(one, element) for one in content) if nested else element * len(content)
-    return 4 + len(content) * (4 if isinstance(content, str) else 1)
-
-
-def _plain(given: ua.Variant | None, register: Register) -> Any:
-    """Return the value of a variant, or None if its type does not fit the register."""
-    if given is None or given.Value is None:
-        return None
-    if register.dims and given.VariantType == ua.VariantType.ByteString and data_type(register) == ua.VariantType.Byte:
-        return list(given.Value)
-    if given.VariantType != data_type(register) or bool(given.is_array) != bool(register.dims):
-        return None
-    return given.Value
-
-
-def _part(value: ua.DataValue, text: str) -> ua.DataValue:
-    """Return the part of a one-dimensional array that ``2`` or ``2:5`` selects (OPC 10000-4, section 7.27)."""
-    first, colon, last = text.partition(":")
-    if not (first.isdecimal() and (last.isdecimal() if colon else True)) or len(text) > 20:
-        return bad(Fault.BadIndexRangeInvalid)
-    low, high = int(first), int(last if colon else first)
-    if colon and low >= high:
-        return bad(Fault.BadIndexRangeInvalid)
-    if value.Value is None:
-        return value
-    content = value.Value.Value
-    whole = isinstance(content, list) and not value.Value.Dimensions
-    if not whole or low >= len(content):
-        return bad(Fault.BadIndexRangeNoData)
-    found = ua.Variant(content[low : high + 1], value.Value.VariantType, is_array=True)
-    return ua.DataValue(found, value.StatusCode, value.SourceTimestamp, value.ServerTimestamp)

@@ -8,6 +8,7 @@ from typing import Any, Final
 from asyncua import ua
 from asyncua.common.utils import ServiceError
 from asyncua.server.address_space import AddressSpace, NodeData
+from asyncua.ua.ua_binary import struct_to_binary
 
 from shmio.endpoints.opcua.feed import Feed, Watch
 from shmio.endpoints.opcua.nodes import (
@@ -21,6 +22,8 @@ from shmio.endpoints.opcua.nodes import (
     SourceNode,
     VariableNode,
 )
+from shmio.endpoints.opcua.parts import PartOfVariable, check_range
+from shmio.endpoints.opcua.shares import Share
 from shmio.errors import PathError
 from shmio.layout.topic import find
 
@@ -60,9 +63,10 @@ class Space:
         for watch in old.watches:
             node = self.find(ua.NodeId(watch.key, NAMESPACE))
             if isinstance(node, RegisterNode):
-                source.feed.adopt(watch, node.register.path, node.value)
+                part = PartOfVariable(node, watch.index_range) if watch.index_range else node
+                source.feed.adopt(watch, node.register.path, part)
             else:
-                source.feed.adopt(watch, None, node.value if isinstance(node, VariableNode) else None)
+                source.feed.adopt(watch, None, node if isinstance(node, VariableNode) else None)
 
     # ---- look up -----------------------------------------------------------------------------------------------------
 
@@ -132,10 +136,14 @@ class Space:
         found: NodeData | None = self._standard.get(node_id)
         return None if found is None else iter(found.references)
 
-    def browse(self, asked: ua.BrowseDescription) -> Iterator[Reference] | None:
-        """Return the references that a browse description selects; None if there is no such node."""
+    def browse(self, asked: ua.BrowseDescription) -> Iterator[Reference | None] | None:
+        """Return the references from a node; None if there is no such node.
+
+        In place of a reference that the description does not select, the iterator has None, so that many
+        of these do not delay other clients.
+        """
         found = self.references(asked.NodeId)
-        return None if found is None else (one for one in found if self._suits(asked, one))
+        return None if found is None else (one if self._suits(asked, one) else None for one in found)
 
     def _suits(self, asked: ua.BrowseDescription, reference: Reference) -> bool:
         if asked.BrowseDirection == ua.BrowseDirection.Forward and not reference.IsForward:
@@ -167,12 +175,13 @@ class Space:
             self._supertypes[reference] = frozenset(above)
         return self._supertypes[reference]
 
-    def follow(self, start: ua.NodeId, elements: list[ua.RelativePathElement]) -> list[ua.NodeId]:
+    async def follow(self, start: ua.NodeId, elements: list[ua.RelativePathElement], share: Share) -> list[ua.NodeId]:
         """Return the nodes at the end of a path of browse names.
 
         Args:
             start: The node at which the path starts.
             elements: The path.
+            share: The client's share of the time.
 
         Raises:
             ServiceError: The start node does not exist, or a name is empty.
@@ -182,13 +191,18 @@ class Space:
             raise ServiceError(ua.StatusCodes.BadBrowseNameInvalid)
         if not self.knows(start):
             raise ServiceError(ua.StatusCodes.BadNodeIdUnknown)
-        found = [start]
+        found = {start: None}
         for element in elements:
-            found = [target for node in found for target in self._targets(node, element)]
-        return found
+            before, found = found, {}
+            for node in before:
+                found.update(dict.fromkeys(self._targets(node, element)))
+                await share.turn()
+        return list(found)
 
     def _targets(self, node_id: ua.NodeId, element: ua.RelativePathElement) -> Iterator[ua.NodeId]:
-        for reference in self.references(node_id) or ():
+        node = self.find(node_id)
+        references = node.references_named(element.TargetName.Name) if node else self.references(node_id)
+        for reference in references or ():
             if (
                 reference.BrowseName == element.TargetName
                 and reference.IsForward != element.IsInverse
@@ -198,18 +212,33 @@ class Space:
 
     # ---- changes -----------------------------------------------------------------------------------------------------
 
-    def watch(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> tuple[Watch, float]:
+    def watch(self, node_id: ua.NodeId, attribute: int, roles: Roles, index_range: str = "") -> tuple[Watch, float]:
         """Return the watch of an attribute, and the shortest time between two changes, in ms.
 
+        Args:
+            node_id: The node.
+            attribute: The attribute.
+            roles: Roles of the client.
+            index_range: The part of the attribute; "" for all of it.
+
         Raises:
-            ServiceError: There is no such node or attribute.
+            ServiceError: There is no such node or attribute, or the attribute cannot have such a part.
 
         """
         node = self.find(node_id)
+        if index_range:
+            check_range(index_range)
         if isinstance(node, VariableNode) and attribute == ua.AttributeIds.Value:
-            found = node.watch()
+            if index_range and isinstance(node, RegisterNode):
+                part = PartOfVariable(node, index_range)
+                if part.is_missing():
+                    raise ServiceError(ua.StatusCodes.BadIndexRangeNoData)
+                return node.feed.watch(node.register.path, part, index_range), node.period_ms
+            found = None if index_range else node.watch()
             if found is not None:
                 return found, node.period_ms
+        if index_range:
+            raise ServiceError(ua.StatusCodes.BadIndexRangeNoData)  # nothing else has a value that changes in parts
         value = self.read(node_id, attribute, roles)
         if value.StatusCode is not None and value.StatusCode.value in (
             ua.StatusCodes.BadNodeIdUnknown,
@@ -240,7 +269,7 @@ class StaticWatch(Watch):
         standard: AddressSpace | None,
         get: Callable[[], ua.DataValue],
     ) -> None:
-        super().__init__(_Unfollowed(), str(node), get)  # type: ignore[arg-type]  # it has the methods of a feed that a watch calls
+        super().__init__(_Unfollowed(), str(node), _Attribute(get))  # type: ignore[arg-type]  # it has the methods of a feed that a watch calls
         self._space, self._node, self._standard = space, node, standard
         self._handle = 0
         if standard is not None:
@@ -252,14 +281,29 @@ class StaticWatch(Watch):
     def remove(self, listener: Any) -> None:
         """Remove a listener. The watch ends when its last listener is removed."""
         self.listeners.pop(listener, None)
+        self._armed.pop(listener, None)
         if not self.listeners:
             if self._standard is not None:
                 self._standard.delete_datachange_callback(self._handle)
             self._space.forget(self._node)
 
 
+class _Attribute:
+    """An attribute that clients monitor like a variable."""
+
+    def __init__(self, get: Callable[[], ua.DataValue]) -> None:
+        self.value = get
+
+    def encoded(self) -> bytes:
+        """Return the present value, encoded."""
+        return struct_to_binary(self.value())
+
+
 class _Unfollowed:
     """Substitute for a feed, for watches of attributes that no source changes."""
+
+    def __init__(self) -> None:
+        self.timed: dict[Any, Watch] = {}
 
     def count(self) -> None:
         """Do nothing."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final, NamedTuple
 
@@ -74,6 +75,70 @@ def variant(register: Register, value: Value) -> ua.Variant:
     """Return a register's value as OPC UA sends it."""
     sizes = dimensions(register)
     return ua.Variant(value, data_type(register), sizes if len(sizes) > 1 else None, is_array=bool(sizes))
+
+
+_CODES: Final = {
+    ua.VariantType.Boolean: "?", ua.VariantType.Byte: "B", ua.VariantType.SByte: "b", ua.VariantType.UInt16: "H",
+    ua.VariantType.Int16: "h", ua.VariantType.UInt32: "I", ua.VariantType.Int32: "i", ua.VariantType.UInt64: "Q",
+    ua.VariantType.Int64: "q", ua.VariantType.Float: "f", ua.VariantType.Double: "d",
+}  # fmt: skip
+_TICKS_AT_EPOCH: Final = 116_444_736_000_000_000
+"""1970 as OPC UA counts time: in steps of 100 ns since 1601 (OPC 10000-6, section 5.2.2.5)."""
+_HAS_VALUE, _HAS_STATUS, _HAS_SOURCE_TIME, _HAS_SERVER_TIME = 1, 2, 4, 8
+_IS_ARRAY, _HAS_DIMENSIONS = 0x80, 0x40
+_STATUS: Final = struct.Struct("<I")
+_TIME: Final = struct.Struct("<q")
+
+
+def encode(register: Register, state: RegisterState, server_ns: int) -> bytes:
+    """Return a register's state as the binary encoding of a DataValue (OPC 10000-6, section 5.2.2.17).
+
+    The library's encoder does the same in ten times the time.
+
+    Args:
+        register: The register, element or part.
+        state: Its state.
+        server_ns: The time of the frame, in ns since 1970; 0 if unknown.
+    """
+    mask = _HAS_VALUE | _HAS_STATUS
+    parts = [b"", b"\0", _STATUS.pack(state.code)]
+    if state.value is not None:
+        parts[1] = _encode_variant(register, state.value)
+    for bit, time_ns in ((_HAS_SOURCE_TIME, state.source_ns), (_HAS_SERVER_TIME, server_ns)):
+        if time_ns:
+            mask |= bit
+            parts.append(_TIME.pack(time_ns // 1000 * 10 + _TICKS_AT_EPOCH))
+    parts[0] = bytes((mask,))
+    return b"".join(parts)
+
+
+def _encode_variant(register: Register, value: Any) -> bytes:
+    kind = data_type(register)
+    code = _CODES.get(kind)
+    if not register.dims:
+        body = _encode_text(value) if code is None else struct.pack("<" + code, value)
+        return bytes((kind.value,)) + body
+    sizes = register.shape
+    flat = value if len(sizes) == 1 else list(_flat(value))
+    count = struct.pack("<i", len(flat))
+    body = b"".join(map(_encode_text, flat)) if code is None else struct.pack(f"<{len(flat)}{code}", *flat)
+    if len(sizes) == 1:
+        return bytes((kind.value | _IS_ARRAY,)) + count + body
+    dimensions = struct.pack(f"<{1 + len(sizes)}i", len(sizes), *sizes)
+    return bytes((kind.value | _IS_ARRAY | _HAS_DIMENSIONS,)) + count + body + dimensions
+
+
+def _encode_text(text: str) -> bytes:
+    data = text.encode("utf-8", "surrogateescape")
+    return struct.pack("<i", len(data)) + data
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    for one in value:
+        if isinstance(one, list):
+            yield from _flat(one)
+        else:
+            yield one
 
 
 def unit(text: str, namespace: str) -> ua.EUInformation:

@@ -44,7 +44,13 @@ if spec["kind"] == "source":
 slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
 if behaviour == "silent":
     signal.pause()
+asked = Path(spec["log_file"]).with_name("compute")
 while not stopping.wait(0.02):
+    if behaviour == "compute" and asked.exists():
+        until_s = time.thread_time() + float(asked.read_text())
+        while time.thread_time() < until_s:
+            pass
+        asked.unlink()
     slot.beat()
     if spec["kind"] == "source":
         writer.publish(bytes(writer.block.layout.size), cycle=2)

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from shmio.plan.processes import Job
+from shmio.realtime import ProcessorTime
 from shmio.segment import Activity, ProcessSpec, Report, Segment, stale_segment
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.shm import SharedObject
@@ -23,13 +24,18 @@ from shmio.supervisor.policy import Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess
 
 
-@pytest.mark.parametrize(("share", "state"), [(0.6, State.RUNNING), (0.4, State.HUNG)])
+@pytest.mark.parametrize(("share", "state"), [(0.6, State.RUNNING), (0.3, State.HUNG)])
 def test_a_quiet_process_is_not_killed_while_it_waits_for_a_processor(
-    instance: str, share: float, state: State, monkeypatch: pytest.MonkeyPatch
+    instance: str, share: float, state: State, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What the process had waited before its last heartbeat does not count."""
+    """What the process had waited before its last heartbeat does not count. The log says why it is killed."""
     begun_ns = now_ns = time.monotonic_ns()
-    monkeypatch.setattr(AdoptedProcess, "waited_ns", lambda _: 10**12 + round((now_ns - begun_ns) * share))
+
+    def scheduled(_: object) -> ProcessorTime:
+        passed_ns = now_ns - begun_ns
+        return ProcessorTime(10**11 + passed_ns // 2, 10**12 + round(passed_ns * share))
+
+    monkeypatch.setattr(AdoptedProcess, "processor_time", scheduled)
     with (
         Segment.create(instance, [], [ProcessSpec("plc", "emulator")]) as segment,
         selectors.DefaultSelector() as selector,
@@ -44,6 +50,9 @@ def test_a_quiet_process_is_not_killed_while_it_waits_for_a_processor(
                 now_ns += 100_000_000
                 fleet.check(now_ns)
             assert managed.life.state is state
+            killed = state is State.HUNG
+            evidence = "no heartbeat for 5 s; meanwhile its threads ran for 3.2 s and waited 1.9 s for a processor"
+            assert [evidence in line for line in caplog.messages] == [True] * killed
             os.close(managed.child.pidfd)
         finally:
             child.kill()

@@ -36,7 +36,7 @@ def test_a_child_that_does_not_read_its_description_blocks_nothing(
 
 def test_an_ended_process_no_longer_waits_for_a_processor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mute.py").write_text("")
-    assert run("mute", tmp_path, monkeypatch)[0].waited_ns() == 0
+    assert run("mute", tmp_path, monkeypatch)[0].processor_time() == (0, 0)
 
 
 def test_last_words_are_of_this_process_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ def test_nodes_come_and_go_and_subscriptions_continue(segment: Segment) -> None:
             await changes.until("cell/step", lambda value: value.Value.Value == 5)
             new = node(client, "cell/new")
             assert await new.read_value() == 7
-            unit = await (await new.get_child("2:EngineeringUnits")).read_value()
+            unit = await (await new.get_child("0:EngineeringUnits")).read_value()
             assert (unit.DisplayName.Text, unit.UnitId) == ("mm", 5066068)
             assert (await new.read_description()).Text == "way"
             names = [(await child.read_browse_name()).Name for child in await node(client, "cell").get_children()]
