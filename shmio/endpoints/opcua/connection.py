@@ -188,9 +188,11 @@ class Processor(UaProcessor):
                 raise ServiceError(Fault.BadSecurityPolicyRejected)
             if kind not in _SESSIONS and kind not in _SERVED:
                 raise ServiceError(Fault.BadServiceUnsupported)
-        if kind == _IDS.CreateSessionRequest_Encoding_DefaultBinary and self.session is not None:
-            await self.session.close_session()  # asyncua would never remove the old session
-            self.session = None
+        if kind == _IDS.CreateSessionRequest_Encoding_DefaultBinary:
+            if self.session is not None:
+                await self.session.close_session()  # asyncua would never remove the old session
+                self.session = None
+            await self.iserver.make_room()
         elif kind == _IDS.ActivateSessionRequest_Encoding_DefaultBinary:
             return await self._activate(typeid, requesthdr, seqhdr, body)
         elif kind in _SERVED and self.session is not None:
@@ -223,12 +225,15 @@ class Processor(UaProcessor):
             if taken_over:
                 self.session = None
             raise
+        session.detached = False
         for one in self.iserver.subscriptions.of(session):
             session.attach(one, self.forward_publish_response, self.get_publish_request)
         return done
 
     def _should_close_session_on_transport_loss(self) -> bool:
         session: Any = self.session
+        if session is not None:
+            session.detached = True
         if session is None or not session.is_activated():
             return session is not None
         return not self.iserver.subscriptions.of(session)

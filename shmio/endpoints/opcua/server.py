@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -53,6 +54,8 @@ _OAEP: Final[dict[str, Callable[[Any, bytes], bytes]]] = {
 }
 """The accepted encryptions of passwords. PKCS 1.5 is missing, because padding attacks can break it."""
 _SHA1: Final = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
+SILENT_S: Final = 30.0
+"""Time in s without a request after which a session ends if others need its place."""
 _LIMITS: Final = {
     "MaxNodesPerRead": MAX_NODES, "MaxNodesPerWrite": MAX_WRITES, "MaxNodesPerMethodCall": MAX_CALLS,
     "MaxNodesPerBrowse": MAX_NODES, "MaxNodesPerTranslateBrowsePathsToNodeIds": MAX_NODES,
@@ -115,9 +118,27 @@ class InternalServer(LibraryInternalServer):
         Raises:
             ServiceError: There are too many sessions.
         """
-        if len(self._external_sessions) >= MAX_SESSIONS:
+        if self._activated >= MAX_SESSIONS:
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
         return Session(self, self.aspace, self.subscription_service, name, external=external)
+
+    @property
+    def _activated(self) -> int:
+        """Number of activated sessions. The number of others is bounded by that of their connections."""
+        return sum(one.is_activated() for one in self._external_sessions.values())
+
+    async def make_room(self) -> None:
+        """If there are too many sessions, end one that has lost its connection, or has been silent for long."""
+        if self._activated < MAX_SESSIONS:
+            return
+        silent_s = time.monotonic() - SILENT_S
+        unused: list[Any] = [
+            one for one in self._external_sessions.values() if one.detached or one._last_activity < silent_s
+        ]
+        if unused:
+            oldest = min(unused, key=lambda one: (not one.detached, one._last_activity))
+            log.warning("a session ends to make room for another one: its client does not use it")
+            await oldest.close_session()
 
     @property
     def sessions(self) -> int:

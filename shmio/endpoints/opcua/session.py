@@ -67,6 +67,8 @@ class Session(InternalSession):
             self.iserver.register_external_session(self)
         self.trusted_channel = False
         """True if the client may send its password in plain text: the channel is encrypted, or stays on this host."""
+        self.detached = False
+        """True if the session has lost its connection."""
         self._continuations: dict[bytes, Any] = {}
 
     @property

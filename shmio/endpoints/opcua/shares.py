@@ -2,7 +2,7 @@
 
 One thread serves all clients. It does the work for a client in slices of ``SLICE_S``, between which other
 clients proceed, and a client that has used its share of the time waits. The share of a client depends on
-how many others have used up theirs; a client that needs little never waits.
+how many others are busy; a client that needs little never waits.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ SLICE_S: Final = 0.001
 CLIENT_SHARE: Final = 0.3
 """Largest part of the endpoint's time that the work for one client takes."""
 ALL_SHARE: Final = 0.6
-"""Largest part of the time that the work for all clients that have used up their shares takes."""
-BURST_S: Final = 0.05
-"""Time in s for which a client may use more than its share after it has used less."""
+"""Largest part of the time that the work for all busy clients takes."""
+ALONE_SHARE: Final = 0.9
+"""Part of the time that the work for the only client takes."""
+BURST_S: Final = 0.5
+"""Time in s that a client which has used less than its share may use at once, as for its first requests."""
 BUSY_S: Final = 1.0
-"""Time in s for which a client counts as busy after it has used up its share."""
+BUSY_SHARE: Final = 0.02
+"""A client that has used this part of the last ``BUSY_S`` counts as busy: all busy clients share ``ALL_SHARE``."""
 
 
 class Shares:
@@ -30,10 +33,15 @@ class Shares:
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.clock = clock
+        self._open = 0
         self._busy_s: dict[Share, float] = {}
 
+    def open(self) -> None:
+        """Count a client that has connected."""
+        self._open += 1
+
     def report_busy(self, share: Share, now_s: float) -> None:
-        """Record that a client has used up its share."""
+        """Record that a client is busy."""
         self._busy_s.pop(share, None)
         self._busy_s[share] = now_s
         while now_s - self._busy_s[first := next(iter(self._busy_s))] > BUSY_S:
@@ -41,11 +49,14 @@ class Shares:
 
     def forget(self, share: Share) -> None:
         """Forget a client that has disconnected."""
+        self._open -= 1
         self._busy_s.pop(share, None)
 
     @property
     def rate(self) -> float:
         """The part of the time that each client has."""
+        if self._open <= 1:
+            return ALONE_SHARE
         return min(CLIENT_SHARE, ALL_SHARE / max(1, len(self._busy_s)))
 
 
@@ -54,9 +65,11 @@ class Share:
 
     def __init__(self, shares: Shares) -> None:
         self._shares = shares
+        shares.open()
         self._credit_s = BURST_S
         self._depth = 0
-        self._at_s = self._begun_s = shares.clock()
+        self._recent_s = 0.0
+        self._at_s = self._begun_s = self._recent_at_s = shares.clock()
 
     def __enter__(self) -> None:
         if self._depth:
@@ -72,9 +85,14 @@ class Share:
     def _charge(self) -> None:
         now_s = self._shares.clock()
         self._refill(now_s)
-        self._credit_s -= now_s - self._begun_s
+        used_s = now_s - self._begun_s
+        self._credit_s -= used_s
         self._begun_s = now_s
-        if self._credit_s < 0:
+        # The time used of late, which fades within BUSY_S.
+        self._recent_s = max(0.0, self._recent_s - (now_s - self._recent_at_s) * BUSY_SHARE) + used_s
+        self._recent_at_s = now_s
+        if self._recent_s > BUSY_SHARE * BUSY_S:
+            self._recent_s = BUSY_SHARE * BUSY_S
             self._shares.report_busy(self, now_s)
 
     def _refill(self, now_s: float) -> None:

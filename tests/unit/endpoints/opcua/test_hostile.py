@@ -12,6 +12,7 @@ from asyncua import Client, ua
 from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import struct_to_binary, variant_from_binary
 
+from shmio.endpoints.opcua.server import SILENT_S
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.opcua.harness import TIMEOUT_S, Changes, Served, node, serve
@@ -62,8 +63,69 @@ def test_what_is_not_opc_ua_ends_its_connection(segment: Segment, data: bytes) -
     serve(segment, test)
 
 
-def test_connections_are_bounded_and_half_open_ones_end(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+async def silent(one: Served, state: str) -> Any:
+    """Open a connection in one of the states that it can have before a session, and leave it there."""
+    if state in ("channel", "session"):
+        client = Client(one.url, timeout=TIMEOUT_S)
+        await client.connect_socket()
+        await client.send_hello()
+        await client.open_secure_channel()
+        if state == "session":
+            await client.create_session()
+        return client.disconnect_socket
+    _, writer = await asyncio.open_connection("127.0.0.1", one.port)
+    writer.write({"open": b"", "half a Hello": hello()[:20], "Hello": hello()}[state])
+    return writer.close
+
+
+@pytest.mark.parametrize("state", ["open", "half a Hello", "Hello", "channel", "session"])
+def test_silent_connections_lock_nobody_out(segment: Segment, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.opcua.connection.MAX_PENDING", 10)
     monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_CONNECTIONS", 5)
+    monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_PENDING", 10)
+    monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_SESSIONS", 2)
+
+    async def test(one: Served) -> None:
+        one.publish(image(step=1))
+        async with one.client() as before:
+            close = [await silent(one, state) for _ in range(25)]
+            async with one.client() as client:
+                assert await node(client, "cell/step").read_value() == 1
+            assert await node(before, "cell/step").read_value() == 1
+            for end in close:
+                end()
+
+    serve(segment, test)
+
+
+def test_sessions_that_nobody_uses_make_room(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_SESSIONS", 2)
+
+    async def test(one: Served) -> None:
+        one.publish(image(step=1))
+        async with one.client() as used, one.client() as lost:
+            await lost.create_subscription(20, Changes())  # the session outlives its connection
+            with pytest.raises(ua.UaStatusCodeError) as refused:
+                async with one.client():
+                    pass
+            assert refused.value.code == ua.StatusCodes.BadTooManySessions
+            lost.disconnect_socket()
+            sessions = one.endpoint.server.iserver._external_sessions
+            await one.until(lambda: any(session.detached for session in sessions.values()))
+            async with one.client() as third:
+                assert await node(third, "cell/step").read_value() == 1
+                assert await node(used, "cell/step").read_value() == 1
+                (silent, _) = sessions.values()
+                silent._last_activity -= SILENT_S + 1
+                async with one.client() as fourth:
+                    assert await node(fourth, "cell/step").read_value() == 1
+
+    serve(segment, test)
+
+
+def test_connections_are_bounded_and_half_open_ones_end(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_CONNECTIONS", 2)
+    monkeypatch.setattr("shmio.endpoints.opcua.server.MAX_PENDING", 3)
     monkeypatch.setattr("shmio.endpoints.opcua.server.ACTIVATION_S", 0.5)
 
     async def test(one: Served) -> None:

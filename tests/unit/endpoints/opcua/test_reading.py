@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from asyncua import ua
+from asyncua.ua.ua_binary import struct_to_binary
 
+from shmio.endpoints.opcua.values import RegisterState, encode, moment, variant
 from shmio.layout.model import Layout, Register
 from shmio.model.statuses import RegisterStatus, status_area
 from shmio.segment import Quality, Segment
@@ -197,3 +200,53 @@ def test_bytes_written_to_connections_are_counted(segment: Segment) -> None:
             await one.until(lambda: one.endpoint.counters[4] - before == received > 0)
 
     serve(segment, test)
+
+
+def test_the_encoder_gives_the_bytes_of_the_library() -> None:
+    cases: list[tuple[str, tuple[tuple[int, int], ...], Any]] = [
+        ("BOOL", (), True), ("BYTE", (), 200), ("SINT", (), -3), ("INT", (), -300), ("UINT", (), 60_000),
+        ("DINT", (), -70_000), ("UDINT", (), 4_000_000_000), ("LINT", (), -(2**62)), ("ULINT", (), 2**64 - 1),
+        ("REAL", (), 1.5), ("LREAL", (), float("inf")), ("STRING[9]", (), "größer"), ("WSTRING[9]", (), "\udcff"),
+        ("DATE", (), "2026-02-03"), ("REAL", ((0, 2),), [1.0, 2.0, 3.0]), ("BOOL", ((1, 2),), [True, False]),
+        ("STRING[9]", ((0, 1),), ["a", ""]), ("INT", ((0, 1), (0, 2)), [[1, 2, 3], [4, 5, 6]]), ("INT", (), None),
+    ]  # fmt: skip
+    for kind, dims, value in cases:
+        register = Register("x", kind, dims, 0, None, 8, 1)
+        for code, source_ns, server_ns in ((0, 0, 0), (0x80310000, 1_700_000_000_123_456_789, 0), (0x960000, 1, 2_000)):
+            state = RegisterState(value, code, source_ns)
+            expected = ua.DataValue(
+                None if value is None else variant(register, value), ua.StatusCode(code),
+                moment(source_ns) if source_ns else None, moment(server_ns) if server_ns else None,
+            )  # fmt: skip
+            assert encode(register, state, server_ns) == struct_to_binary(expected), (kind, dims, value)
+
+
+def test_properties_and_types_of_the_standard_have_its_names(instance: str) -> None:
+    """Of a variable with a unit and no range: AnalogUnitType, with 0:EngineeringUnits (OPC 10000-8, section 5.3.2)."""
+    registers = (
+        Register("force", "REAL", (), 0, None, 4, 1, unit="kN"),
+        Register("plain", "REAL", (), 4, None, 4, 1),
+        Register("text", "STRING[6]", (), 8, None, 8, 1, unit="mm"),
+    )
+    layout = Layout("DB1", 1, 16, False, registers)
+
+    async def test(one: Served) -> None:
+        async with one.client() as client:
+            force = node(client, "cell/force")
+            unit = await force.get_child("0:EngineeringUnits")
+            assert (await unit.read_browse_name()) == ua.QualifiedName("EngineeringUnits", 0)
+            assert (await unit.read_value()).UnitId == int.from_bytes(b"B47", "big")
+            assert await unit.read_data_type() == ua.NodeId(ua.ObjectIds.EUInformation)
+            names = [await found.read_browse_name() for found in await force.get_properties()]
+            assert [str(name.NamespaceIndex) + name.Name for name in names] == [
+                "0EngineeringUnits", "2Provenance", "2Injected",
+            ]  # fmt: skip
+            kinds = [await node(client, f"cell/{path}").read_type_definition() for path in ("force", "plain", "text")]
+            base = ua.NodeId(ua.ObjectIds.BaseDataVariableType)
+            assert kinds == [ua.NodeId(ua.ObjectIds.AnalogUnitType), base, base]
+            with pytest.raises(ua.uaerrors.BadNoMatch):
+                await force.get_child("2:EngineeringUnits")
+
+    with Segment.create(instance, [spec(layout=layout)], processes()) as segment:
+        serve(segment, test)
+        segment.unlink()
