@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any, Final
 
 from asyncua import Server as Library
@@ -269,17 +270,67 @@ class Server(Library):
         return self.bserver.port if self.bserver is not None else 0
 
 
+_NESTED: Final = (ua.RelativePathElement, ua.SimpleAttributeOperand, ua.ContentFilterElement)
+"""Structures of which one item of a request can have many."""
+MAX_NESTED: Final = 1_000
+"""Maximum number of such structures in an item."""
+
+
+@cache
 def bound_decoding() -> None:
-    """Make the library refuse arrays of nulls.
+    """Make the library refuse what would take too much time or memory, and read on where one item is wrong.
 
-    The elements of such an array take no bytes in a message, so a short message could fill the
-    memory.
+    The elements of an array of nulls take no bytes in a message, so a short message could fill the
+    memory. An unknown number of an enumeration, or an extension object that cannot be decoded, makes the
+    library refuse the whole request; now the item has the bare number, or the bare bytes.
     """
-    original = ua_binary.unpack_uatype_array
+    unpack, create_list = ua_binary.unpack_uatype_array, ua_binary._create_list_deserializer
+    create_enum, read_extension = ua_binary.create_enum_deserializer, ua_binary.extensionobject_from_binary
 
-    def unpack(vtype: Any, data: Any) -> Any:
+    def unpack_array(vtype: Any, data: Any) -> Any:
         if vtype == ua.VariantType.Null:
             raise ua.uaerrors.UaStatusCodeError(ua.StatusCodes.BadDecodingError)
-        return original(vtype, data)
+        return unpack(vtype, data)
 
-    ua_binary.unpack_uatype_array = unpack
+    @cache
+    def create_list_reader(kind: Any) -> Callable[[Any], Any]:
+        read = create_list(kind)
+
+        def bounded(data: Any) -> Any:
+            if struct.unpack("<i", data.copy(4).read(4))[0] > MAX_NESTED:
+                raise ua.uaerrors.UaStatusCodeError(ua.StatusCodes.BadDecodingError)
+            return read(data)
+
+        return bounded if kind in _NESTED else read
+
+    def create_enum_reader(kind: Any) -> Callable[[Any], Any]:
+        read = create_enum(kind)
+
+        def tolerant(data: Any) -> Any:
+            number = data.copy(4)
+            try:
+                return read(data)
+            except ValueError:
+                return ua_binary.Primitives.Int32.unpack(number)
+
+        return tolerant
+
+    def read_extension_object(data: Any) -> Any:
+        again = data.copy()
+        try:
+            return read_extension(data)
+        except (ua.UaError, ValueError, struct.error, TypeError, RecursionError):
+            kind, encoding = ua_binary.nodeid_from_binary(again), again.read(1)
+            if encoding != b"\1" or (body := ua_binary.Primitives.ByteString.unpack(again)) is None:
+                raise
+            return ua.ExtensionObject(kind, body)
+
+    ua_binary.unpack_uatype_array = unpack_array
+    ua_binary._create_list_deserializer = create_list_reader
+    ua_binary.create_enum_deserializer = create_enum_reader
+    ua_binary.extensionobject_from_binary = read_extension_object
+    for cached in (
+        ua_binary._create_uatype_deserializer, ua_binary._create_uatype_array_deserializer,
+        ua_binary._create_type_deserializer, ua_binary._create_dataclass_deserializer,
+    ):  # fmt: skip
+        cached.cache_clear()

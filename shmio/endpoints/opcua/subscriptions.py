@@ -23,6 +23,7 @@ from typing import Any, Final
 from asyncua import ua
 from asyncua.common.utils import ServiceError
 from asyncua.ua.ua_binary import struct_to_binary
+from asyncua.ua.uaprotocol_auto import DataChangeFilter  # ua.DataChangeFilter is a subclass, which is never decoded
 
 from shmio.endpoints.opcua.feed import Watch
 from shmio.endpoints.opcua.requests import MAX_OWN_ITEMS, MAX_OWN_SUBSCRIPTIONS
@@ -138,7 +139,7 @@ class Item:
         self._deadband = 0.0
         if asked is None or (isinstance(asked, ua.ExtensionObject) and asked.Body is None):
             return
-        if not isinstance(asked, ua.DataChangeFilter):
+        if not isinstance(asked, DataChangeFilter):
             raise ServiceError(Fault.BadMonitoredItemFilterUnsupported)
         if asked.Trigger not in _TRIGGERS:
             raise ServiceError(Fault.BadMonitoredItemFilterInvalid)

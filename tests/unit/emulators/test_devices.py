@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from asyncua import Client, ua
 
 from shmio.config import Address
 from shmio.connectors.base import Connector
@@ -29,7 +32,6 @@ from shmio.testing.cell import until
 from shmio.testing.ports import reserved_port
 from shmio.testing.write_conformance import write as written
 
-pytest.importorskip("asyncua")
 pytest.importorskip("pymodbus")
 
 MODBUS: dict[str, object] = {
@@ -325,3 +327,54 @@ def test_a_data_block_changes_by_names() -> None:
             assert values(other, after) == {
                 "first": [7] * 5, "flag": True, "speed": 9.5, "name": "abc", "last": 1.5,
             }  # fmt: skip
+
+
+def test_opcua_serves_parts_of_arrays_and_texts() -> None:
+    """Index ranges (OPC 10000-4, section 7.27): a write changes nothing but the named elements."""
+    read, refused = ua.ReadValueId, ua.StatusCodes
+
+    def at(name: str, text: str) -> ua.ReadValueId:
+        return read(ua.NodeId(name, 2), ua.AttributeIds.Value, text)
+
+    async def use(address: Address) -> None:
+        async with Client(f"opc.tcp://{address}", timeout=20) as client:
+
+            async def values_at(*asked: tuple[str, str]) -> list[object]:
+                params = ua.ReadParameters(NodesToRead=[at(*one) for one in asked])
+                found = await client.uaclient.read(params)
+                return [one.Value.Value if one.StatusCode.is_good() else one.StatusCode.value for one in found]
+
+            async def write_at(name: str, text: str, value: object, kind: ua.VariantType) -> int:
+                written = ua.DataValue(ua.Variant(value, kind))
+                asked = ua.WriteValue(ua.NodeId(name, 2), ua.AttributeIds.Value, text, written)
+                (status,) = await client.uaclient.write(ua.WriteParameters([asked]))
+                return int(status.value)
+
+            assert await values_at(
+                ("list", "1,0:1"), ("bits", "2"), ("text", "1:3"), ("list", "2,0"), ("bits", "3:1"), ("time", "0"),
+            ) == [
+                [[4, 5]], [True], "röß", refused.BadIndexRangeNoData, refused.BadIndexRangeInvalid,
+                refused.BadIndexRangeNoData,
+            ]  # fmt: skip
+            seen: asyncio.Queue[object] = asyncio.Queue()
+            handler = SimpleNamespace(datachange_notification=lambda _node, value, _data: seen.put_nowait(value))
+            subscription = await client.create_subscription(10, handler)
+            options = ua.MonitoringParameters(1, 0.0, None, 1, True)
+            item = ua.MonitoredItemCreateRequest(at("list", "0,1:2"), ua.MonitoringMode.Reporting, options)
+            await subscription.create_monitored_items([item])
+            assert await asyncio.wait_for(seen.get(), 20) == [[2, 3]]
+            kinds = ua.VariantType
+            assert await write_at("list", "1,0", [[40]], kinds.Int32) == refused.Good
+            assert await write_at("list", "0,2", [[30]], kinds.Int32) == refused.Good
+            assert await asyncio.wait_for(seen.get(), 20) == [[2, 30]]
+            assert await write_at("bits", "1", [True], kinds.Boolean) == refused.Good
+            assert await write_at("text", "0:1", "GR", kinds.String) == refused.Good
+            assert await write_at("list", "1,2:3", [[1, 2]], kinds.Int32) == refused.BadIndexRangeNoData
+            assert await write_at("list", "1,1:2", [[1]], kinds.Int32) == refused.BadIndexRangeDataMismatch
+            assert await write_at("list", "1,1", [[1.0]], kinds.Double) == refused.BadTypeMismatch
+            assert await values_at(("list", "0:1,0:2"), ("bits", "0:3"), ("text", "0:20")) == [
+                [[1, 2, 30], [40, 5, 6]], [True, True, True, True], "GRößer",
+            ]  # fmt: skip
+
+    with device("opcua", [Served(table(OPCUA), {})]) as (_, address):
+        asyncio.run(use(address))

@@ -219,6 +219,68 @@ def test_an_array_of_nothing_is_refused(segment: Segment) -> None:
     serve(segment, test)
 
 
+def test_a_wrong_item_costs_only_itself(segment: Segment) -> None:
+    """Numbers that are in no enumeration, structures that cannot be decoded, and texts that are not UTF-8."""
+
+    async def test(one: Served) -> None:
+        one.publish(image(step=1))
+        async with one.client() as client:
+            step, unknown = ua.NodeId("cell/step", 2), ua.NodeId("\udcff", 2)
+
+            def browse(direction: int) -> ua.BrowseDescription:
+                asked = ua.BrowseDescription(step, ua.BrowseDirection.Forward, ua.NodeId(), True, 0, 63)
+                asked.BrowseDirection = direction
+                return asked
+
+            found = await client.uaclient.browse(ua.BrowseParameters(NodesToBrowse=[browse(9), browse(0)]))
+            assert [result.StatusCode.name for result in found] == ["BadBrowseDirectionInvalid", "Good"]
+            values = [ua.ReadValueId(which, ua.AttributeIds.Value) for which in (unknown, step)]
+            values.append(ua.ReadValueId(step, 9_999))
+            read = await client.uaclient.read(ua.ReadParameters(NodesToRead=values))
+            assert [value.StatusCode.name for value in read] == ["BadNodeIdUnknown", "Good", "BadAttributeIdInvalid"]
+            asked = ua.CreateSubscriptionParameters(20.0, 100, 10, 0, True, 0)
+            made = await client.uaclient.create_subscription(asked, lambda _: None)
+
+            def item(mode: int, given: Any) -> ua.MonitoredItemCreateRequest:
+                options = ua.MonitoringParameters(1, 0.0, given, 1, True)
+                request = ua.MonitoredItemCreateRequest(values[1], ua.MonitoringMode.Reporting, options)
+                request.MonitoringMode = mode
+                return request
+
+            broken = ua.ExtensionObject(ua.NodeId(ua.ObjectIds.DataChangeFilter_Encoding_DefaultBinary), b"\1\2")
+            strange = ua.DataChangeFilter(ua.DataChangeTrigger.Status, 0, 0.0)
+            strange.Trigger = 77
+            items = [item(9, None), item(2, broken), item(2, strange), item(2, None)]
+            params = ua.CreateMonitoredItemsParameters(made.SubscriptionId, ua.TimestampsToReturn.Both, items)
+            results = await client.uaclient.create_monitored_items(params)
+            assert [result.StatusCode.name for result in results] == [
+                "BadMonitoringModeInvalid", "BadMonitoredItemFilterUnsupported", "BadMonitoredItemFilterInvalid",
+                "Good",
+            ]  # fmt: skip
+            long = ua.RelativePath([ua.RelativePathElement(ua.NodeId(), False, True, ua.QualifiedName("x", 2))] * 2_000)
+            with pytest.raises(ua.UaStatusCodeError):
+                await client.uaclient.translate_browsepaths_to_nodeids([ua.BrowsePath(step, long)])
+            assert await node(client, "cell/step").read_value() == 1
+
+    serve(segment, test)
+
+
+def test_an_answer_that_the_client_cannot_take_costs_only_its_request(segment: Segment) -> None:
+    async def test(one: Served) -> None:
+        one.publish(image(step=1))
+        client = Client(one.url, timeout=TIMEOUT_S)
+        async with client:
+            protocol: Any = one.endpoint.server.bserver.clients[0].processor
+            protocol._limits.max_message_size = 70_000  # what a Hello with this limit sets
+            many = [ua.ReadValueId(ua.NodeId("cell/long", 2), ua.AttributeIds.Value)] * 200
+            with pytest.raises(ua.UaStatusCodeError) as refused:
+                await client.uaclient.read(ua.ReadParameters(NodesToRead=many))
+            assert refused.value.code == ua.StatusCodes.BadResponseTooLarge
+            assert await node(client, "cell/step").read_value() == 1
+
+    serve(segment, test)
+
+
 def test_services_that_would_change_the_address_space_are_refused(segment: Segment) -> None:
     async def test(one: Served) -> None:
         async with one.client() as client:

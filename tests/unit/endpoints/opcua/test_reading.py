@@ -180,6 +180,26 @@ def test_a_queue_keeps_the_values_in_between_and_says_what_it_lost(segment: Segm
     serve(segment, test)
 
 
+def test_a_dead_band_holds_small_changes_back(segment: Segment) -> None:
+    async def test(one: Served) -> None:
+        one.publish(image(position=0.0))
+        async with one.client() as client:
+            changes = Changes()
+            subscription = await client.create_subscription(20, changes)
+            position = node(client, "cell/axis/position")
+            given = ua.DataChangeFilter(ua.DataChangeTrigger.StatusValue, ua.DeadbandType.Absolute, 1.0)
+            await subscription._subscribe(position, ua.AttributeIds.Value, mfilter=given)
+            await subscription.subscribe_data_change(node(client, "cell/step"))
+            await changes.until("cell/step", lambda value: value.Value.Value == 0)
+            for step, value in ((1, 0.9), (2, 1.5), (3, 2.4), (4, 3.0)):
+                one.publish(image(position=value, step=step))
+                await changes.until("cell/step", lambda value, step=step: value.Value.Value == step)  # type: ignore[misc]
+            seen = [value.Value.Value for path, value in changes.seen if path == "cell/axis/position"]
+            assert seen == [0.0, 1.5, 3.0]
+
+    serve(segment, test)
+
+
 def test_bytes_written_to_connections_are_counted(segment: Segment) -> None:
     async def test(one: Served) -> None:
         received = 0

@@ -80,6 +80,24 @@ def test_what_cannot_be_written_is_refused_with_a_fitting_status(segment: Segmen
     with_plant(segment, test)
 
 
+def test_a_text_that_is_not_utf_8_costs_only_its_own_write(segment: Segment) -> None:
+    async def test(one: Served, plant: Plant) -> None:
+        async with one.client() as client:
+            values = [("cell/name", "\udcff", ua.VariantType.String), ("\udcff", 1, ua.VariantType.Int16)]
+            values.append(("cell/step", 5, ua.VariantType.Int16))
+            asked = [
+                ua.WriteValue(
+                    ua.NodeId(path, 2), ua.AttributeIds.Value, None, ua.DataValue(ua.Variant(value, kind))
+                )
+                for path, value, kind in values
+            ]  # fmt: skip
+            found = await client.uaclient.write(ua.WriteParameters(asked))
+            assert [status.name for status in found] == ["BadOutOfRange", "BadNodeIdUnknown", "Good"]
+            assert plant.memory[12:14] == b"\0\5"
+
+    with_plant(segment, test)
+
+
 def test_roles_of_accounts(segment: Segment) -> None:
     hashed = hashlib.sha256(PASSWORD.encode()).hexdigest()
     operator_account = Token(name="operator", roles=["read", "write"], sha256=hashed)
