@@ -298,6 +298,12 @@ def test_benchmark_of_serving_opc_ua() -> None:
     assert len(re.findall(r"^1 client, (?:shmio|asyncua alone) +[1-9]\d* +[1-9]\d* .*[\w)]$", found, re.MULTILINE)) == 2
 
 
+def test_benchmark_of_neighbours_on_the_opc_ua_endpoint() -> None:
+    pytest.importorskip("asyncua")
+    found = printed("opcua_neighbours")
+    assert len(re.findall(r"^[\w ,]+(?: +\d+\.\d){5} +no$", found, re.MULTILINE)) == 10, found
+
+
 def test_benchmark_of_sixteen_sources() -> None:
     pytest.importorskip("asyncua")
     pytest.importorskip("pymodbus")

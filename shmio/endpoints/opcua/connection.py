@@ -245,10 +245,14 @@ class _CountedTransport:
     def __init__(self, transport: asyncio.BaseTransport, counters: Any) -> None:
         self._transport: Any = transport
         self._counters = counters
+        self.share: Share | None = None
+        """The client's share of the endpoint's time."""
 
     def write(self, data: bytes) -> None:
         self._counters.sent_messages += 1
         self._counters.sent_bytes += len(data)
+        if self.share is not None:
+            self.share.count_bytes(len(data))
         self._transport.write(data)
 
     def __getattr__(self, name: str) -> Any:
@@ -282,6 +286,7 @@ class Protocol(OPCUAProtocol):
             return
         self.processor: Any = Processor(self.iserver, self.transport, self.limits)
         self.processor.set_policies(self.policies)
+        counted.share = self.processor.share
         self.transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
 
     def connection_lost(self, ex: BaseException | None) -> None:

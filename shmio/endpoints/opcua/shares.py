@@ -28,6 +28,10 @@ BUSY_SHARE: Final = 0.02
 """A client that has used this part of the last ``BUSY_S`` counts as busy: all busy clients share ``ALL_SHARE``."""
 
 
+BYTE_S: Final = 20e-9
+"""Time in s that each byte for a client counts in addition, because the network and the client need time, too."""
+
+
 class Shares:
     """The time that clients use, and the share that each of them has. Use it only in the event loop's thread."""
 
@@ -94,6 +98,11 @@ class Share:
         if self._recent_s > BUSY_SHARE * BUSY_S:
             self._recent_s = BUSY_SHARE * BUSY_S
             self._shares.report_busy(self, now_s)
+
+    def count_bytes(self, number: int) -> None:
+        """Count bytes that are sent to the client."""
+        self._credit_s -= number * BYTE_S
+        self._recent_s += number * BYTE_S
 
     def _refill(self, now_s: float) -> None:
         self._credit_s = min(BURST_S, self._credit_s + (now_s - self._at_s) * self._shares.rate)

@@ -27,7 +27,7 @@ from asyncua.ua.uaprotocol_auto import DataChangeFilter  # ua.DataChangeFilter i
 
 from shmio.endpoints.opcua.feed import Watch
 from shmio.endpoints.opcua.requests import MAX_OWN_ITEMS, MAX_OWN_SUBSCRIPTIONS
-from shmio.endpoints.opcua.shares import ALL_SHARE, CLIENT_SHARE, Share, Shares
+from shmio.endpoints.opcua.shares import ALL_SHARE, BYTE_S, CLIENT_SHARE, Share, Shares
 
 MIN_PUBLISHING_MS: Final = 20.0
 MAX_PUBLISHING_MS: Final = 60_000.0
@@ -51,8 +51,6 @@ MAX_NOTIFICATIONS: Final = 10_000
 
 ITEM_S: Final = 10e-6
 """Assumed time in s that it takes to sample, encode and send a value."""
-BYTE_S: Final = 5e-9
-"""Assumed additional time in s for each byte of the value."""
 FAST_MS: Final = 1_000.0
 """Items with a longer sampling interval than this, in ms, do not count when intervals are revised."""
 MAX_SAMPLING_MS: Final = 3_600_000.0

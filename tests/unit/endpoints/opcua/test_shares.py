@@ -9,8 +9,8 @@ import pytest
 from asyncua import ua
 
 from shmio.endpoints.opcua.requests import decode
-from shmio.endpoints.opcua.shares import ALL_SHARE, ALONE_SHARE, BURST_S, CLIENT_SHARE, SLICE_S, Share, Shares
-from shmio.endpoints.opcua.subscriptions import BYTE_S, ITEM_S, Costs, Subscription
+from shmio.endpoints.opcua.shares import ALL_SHARE, ALONE_SHARE, BURST_S, BYTE_S, CLIENT_SHARE, SLICE_S, Share, Shares
+from shmio.endpoints.opcua.subscriptions import ITEM_S, Costs, Subscription
 
 
 class Clock:
@@ -72,6 +72,14 @@ def test_a_client_that_was_idle_may_use_a_burst() -> None:
     clock.now_s += 1000
     use(clock, share, 2 * BURST_S)
     assert share.wait_s > 0, "it has saved no more than a burst"
+
+
+def test_bytes_count_as_time() -> None:
+    clock = Clock()
+    shares = Shares(clock)
+    share, _ = Share(shares), Share(shares)
+    share.count_bytes(round(1 / BYTE_S))
+    assert share.wait_s == pytest.approx((1 - BURST_S) / CLIENT_SHARE)
 
 
 def test_only_the_time_counts_in_which_a_coroutine_runs() -> None:
@@ -169,8 +177,8 @@ def test_sampling_intervals_grow_with_what_a_client_asks_for() -> None:
     assert costs.interval_ms(one, ITEM_S, 1000) == pytest.approx(33, rel=0.02)
     for _ in range(4000):
         costs.add(one, ITEM_S + 8000 * BYTE_S)
-    assert costs.interval_ms(one, ITEM_S, 1) == pytest.approx(4000 * 50e-6 / CLIENT_SHARE * 1e3, rel=0.02)
-    assert costs.interval_ms(other, ITEM_S, 1) == pytest.approx(4000 * 50e-6 / ALL_SHARE * 1e3, rel=0.02)
+    assert costs.interval_ms(one, ITEM_S, 1) == pytest.approx(4000 * 170e-6 / CLIENT_SHARE * 1e3, rel=0.02)
+    assert costs.interval_ms(other, ITEM_S, 1) == pytest.approx(4000 * 170e-6 / ALL_SHARE * 1e3, rel=0.02)
     for _ in range(4000):
         costs.add(one, -(ITEM_S + 8000 * BYTE_S))
     assert costs.interval_ms(other, ITEM_S, 1) < 1
