@@ -360,7 +360,8 @@ def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns
 
 def _table(values: list[Any], element: ElementType, layout: Layout) -> Bytes:
     """Encode the values for an element type. Return an array of shape (k, size)."""
-    register = Register(element.name, element.name, (), 0, 0 if element.base == "BOOL" else None, element.size, 1)
+    bit = 0 if element.base == "BOOL" else None
+    register = Register(element.name, element.name, (), 0, bit, element.size, 1, encoding=element.encoding)
     rows = []
     for index, value in enumerate(values):
         image = bytearray(element.size)

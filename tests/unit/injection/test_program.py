@@ -113,6 +113,17 @@ def test_set_takes_json_text_and_s7_literals(path: str, value: Any, expected: Va
     assert becomes(path, empty.get(path, 0), "set", value=value) == expected
 
 
+def test_texts_are_set_and_drawn_in_the_encoding_of_their_register() -> None:
+    layout = LAYOUT.with_encoding("gbk")
+    offset = layout.registers[layout.by_path["name"]].offset
+    for keys in ({"operation": "set", "value": "温"}, {"operation": "random", "values": ["温"]}):
+        declaration = msgspec.convert({"name": "x", "target": "t/name", **keys}, Declaration)
+        image = image_of({}, layout)
+        found = compile_program(declaration, {"t": layout}, {"t": 10_000_000})
+        found.operate(DRAW).apply(image, OperationContext(1, 0, 0, 0))
+        assert image[offset : offset + 4].tobytes() == bytes.fromhex("06 02 ce c2"), keys
+
+
 @given(st.integers(0, 1000), st.floats(0.001, 1000))
 def test_noise_is_within_its_amplitude(place: int, amplitude: float) -> None:
     found = becomes("lreal", 10.0, "noise", place, amplitude=amplitude)
