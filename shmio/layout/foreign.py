@@ -18,7 +18,7 @@ FORMATS: Final = (
     "PLC tags of TIA Portal (.xlsx, .xml, .sdf), XML of TIA Portal Openness, symbol tables of STEP 7 (.sdf, .asc, "
     ".seq), tags of KEPServerEX (.csv), OPC UA NodeSet2 (.xml)"
 )
-HEAD_BYTES: Final = 4096
+_HEAD_BYTES: Final = 4096
 KEPSERVER: Final = "tag name"
 """The first heading of an export of KEPServerEX, in lower case."""
 SHEET: Final = "PLC Tags"
@@ -145,7 +145,7 @@ def is_operand(text: str) -> bool:
 def foreign(file: str, data: bytes) -> str:
     """Return a message that names the kind of a file and the remedy; "" if the file may be a source."""
     name = file.lower()
-    head = data[:HEAD_BYTES]
+    head = data[:_HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):
         return f"this is a spreadsheet or an archive, not the source of a data block; {_conversion(data)}{_INSTEAD}"
     wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))

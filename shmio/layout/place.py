@@ -39,6 +39,7 @@ from shmio.layout.source import system_types
 from shmio.layout.source.constants import BoundFault, Constants
 from shmio.layout.source.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
 from shmio.layout.topic import encode_segment
+from shmio.wording import MAX_NAMES
 
 _MAX_NAME = 128  # characters, as in TIA Portal
 MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
@@ -221,6 +222,7 @@ class Placer:
         cost = Cost()
         good, complete = True, True
         cause: Unknown | None = None
+        lost: list[Member] = []  # members whose places depend on the size of the cause
         section: Section | None = None
         for member in struct.members:
             if member.section is not section:
@@ -232,6 +234,7 @@ class Placer:
                 good = False
                 continue
             if cause is not None:
+                lost.append(member)
                 continue
             unknown = _unknown_in(placed)
             if isinstance(placed, Unknown) or (unknown is not None and isinstance(placed, Repeat)):
@@ -257,6 +260,12 @@ class Placer:
                 complete, cause = False, unknown
         if not good:
             return None
+        if lost:
+            shown = ", ".join(repr(member.name) for member in lost[:MAX_NAMES])
+            more = f" and {len(lost) - MAX_NAMES} more" if len(lost) > MAX_NAMES else ""
+            self._report.add(
+                lost[0].position.warning(f"left out, because their addresses are not known: {shown}{more}")
+            )
         names = tuple(member.name.lower() for member in struct.members) if not complete else ()
         return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height, names=names, open=cause)
 

@@ -27,8 +27,9 @@ from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import SUFFIXES as SOURCES
 from shmio.layout.compiler import Program
-from shmio.layout.foreign import HEAD_BYTES, foreign
+from shmio.layout.foreign import foreign
 from shmio.layout.model import Layout
+from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use
 from shmio.segment import instances
@@ -305,7 +306,7 @@ def _refuse_foreign(path: Path) -> None:
 
     """
     with suppress(OSError), path.open("rb") as stream:  # unreadable files are reported with the others
-        if what := foreign(path.name, stream.read(HEAD_BYTES)):
+        if what := foreign(path.name, stream.read(MAX_SOURCE_BYTES)):
             raise ConfigError(f"{path}: {what}")
 
 

@@ -286,6 +286,11 @@ def test_an_unknown_system_type_costs_the_members_whose_addresses_depend_on_it()
     absolute = program.compile()
     assert offsets(absolute.layouts[0]) == {"x": "0", "p/a": "2"}
     [warning] = [one for one in absolute.warnings if "TON_TIME" in one.message]
+    left = [str(one) for one in absolute.warnings if "left out, because" in one.message]
+    assert left == [
+        "x.db:2:52: warning: left out, because their addresses are not known: 'b'",
+        "x.db:3:53: warning: left out, because their addresses are not known: 'y', 'e'",
+    ]
     assert re.search("leaves them out, and the members after them.*type_bytes.*siemens", warning.message)
     sized = program.compile(type_bytes={"TON_TIME": 16})
     assert offsets(sized.layouts[0]) | {"y": "22"} == offsets(sized.layouts[0])
