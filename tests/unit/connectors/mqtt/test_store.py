@@ -197,6 +197,12 @@ def test_an_alias_of_two_devices(caplog: pytest.LogCaptureFixture) -> None:
     after.sparkplug("DBIRTH/N/a", metric(1, 9, "m"))
     after.sparkplug("DDATA/N/a", metric(2, 7))  # the alias of the other device is not its own
     assert after.status("a").code == BAD_WAITING_FOR_INITIAL_DATA
+    after.sparkplug("NBIRTH/N")
+    after.sparkplug("DBIRTH/N/a", metric(1, 9, "m"))
+    after.sparkplug("DBIRTH/N/a", wire.Metric(name="m", datatype=2, int_value=3))
+    assert (after.value("a"), after.status("a").code) == (3, GOOD)
+    after.sparkplug("DDATA/N/a", metric(2, 9))  # its last birth does not have the alias
+    assert after.status("a").code == BAD_WAITING_FOR_INITIAL_DATA
 
 
 def test_qualities() -> None:
@@ -231,7 +237,7 @@ def test_an_unknown_quality_is_logged_with_its_number(caplog: pytest.LogCaptureF
 
 
 def test_metrics_that_contradict_their_birth_or_have_no_time() -> None:
-    broker = Broker({"m": ("INT", "sparkplug G/N metric m")})
+    broker = Broker({"m": ("DINT", "sparkplug G/N metric m")})
     for given, code in (
         (metric(1, 1), GOOD), (metric(1.0, 1, datatype=10), BAD_TYPE_MISMATCH),
         (wire.Metric(alias=1, int_value=40_000), GOOD), (wire.Metric(alias=1, int_value=100_000), BAD_OUT_OF_RANGE),

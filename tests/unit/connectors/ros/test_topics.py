@@ -70,6 +70,7 @@ def test_shapes() -> None:
         (multi(FLAT, *[(2, 2)] * 40), BAD_INDEX_RANGE_NO_DATA),
         (multi(FLAT, (1 << 62, 6), (3, 3)), BAD_INDEX_RANGE_NO_DATA),
         (multi(TABLE[0], (2, 6), (3, 3)), BAD_INDEX_RANGE_NO_DATA),
+        (multi([*FLAT, 7.0, 8.0], (2, 6), (3, 3)), BAD_INDEX_RANGE_NO_DATA),
     ):  # fmt: skip
         for path, topic, given in (("m", "/m", message), ("u", "/u", {"inner": message})):
             robot.publish(topic, given)
