@@ -304,8 +304,19 @@ def s7_address(tag: Tag) -> str:
     return f"{name}B{start}"
 
 
+NAMES = {
+    "n_bit": ("zz/3.%X5", Tag("BOOL", (), (3, 5))),
+    "n_word": ("zz/4", Tag("WORD", (), (4, 0))),
+    "n_bits": ("zz/6.%X2", Tag("BOOL", (12,), (6, 2))),
+    "n_slice": ("zz/8..10", Tag("BYTE", (3,), (8, 0))),
+    "n_number": ("zz/12", Tag("DINT", (), (12, 0))),
+    "n_numbers": ("zz/4", Tag("INT", (5,), (4, 0))),
+}
+"""Names over an array of bytes: the address, and the register with its first byte and bit in the array."""
+
+
 class S7BlockRig(S7Rig):
-    """The same controller; the layout is the source of a data block."""
+    """The same controller; the layout is the source of a data block, with a table of names over it."""
 
     def layout(self, draw: st.DataObject) -> tuple[Layout, Mapping[str, Tag]]:
         tags = random_tags(draw, S7_KINDS, lambda kind, shape: ())
@@ -314,16 +325,29 @@ class S7BlockRig(S7Rig):
             f"{tag.kind.title()};\n"
             for path, tag in tags.items()
         )
+        members += "zz : Array[0..15] of Byte;\n"
         text = f"DATA_BLOCK \"DB7\"\n{{ S7_Optimized_Access := 'FALSE' }}\nVERSION : 0.1\nSTRUCT\n{members}"
         text += "END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
-        (layout,) = compile_sources([Source("DB7.db", text.encode())]).layouts
+        names = "".join(
+            f'{path} = {{ address = "{address}", type = "{tag.type}" }}\n' for path, (address, tag) in NAMES.items()
+        )
+        files = [Source("DB7.db", text.encode()), Source("names.toml", f"[registers]\n{names}".encode())]
+        (layout,) = compile_sources(files).layouts
+        self._end = layout.size + 16
         self.block[:] = random.Random(draw.draw(st.integers(0, 1 << 32))).randbytes(len(self.block))
         offsets = {one.path: (one.offset, one.bit or 0) for one in layout.registers}
-        return layout, {path: tag._replace(place=("block", *offsets[path])) for path, tag in tags.items()}
+        tags = {path: tag._replace(place=("block", *offsets[path])) for path, tag in tags.items()}
+        start, _ = offsets["zz"]
+        for path, (_, tag) in NAMES.items():
+            byte, bit = tag.place
+            tags[path] = tag._replace(place=("block", start + byte, bit))
+        return layout, tags
 
     def state(self) -> Mapping[Key, object]:
         return {
-            ("block", 8 * at + bit): byte >> bit & 1 for at, byte in enumerate(self.block[:1024]) for bit in range(8)
+            ("block", 8 * at + bit): byte >> bit & 1
+            for at, byte in enumerate(self.block[: self._end])
+            for bit in range(8)
         }
 
 
