@@ -24,7 +24,7 @@ from shmio.connectors.injections import Blocks, InjectionProcessor, OwnerOf
 from shmio.connectors.output import Output, pieces
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
-from shmio.layout.values.write import Write, apply, cover, merge, path_at, paths_outside
+from shmio.layout.values.write import Write, cover, merge, path_at, paths_outside
 from shmio.model.values import NO_WRITER
 from shmio.segment import Command, CommandKind, EventKind, Record
 from shmio.wording import MAX_PATHS, not_writable
@@ -147,7 +147,8 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
     """Merge items into writes. If several items write the same bit, the last item's value counts.
 
     Adjacent bytes become one write only if they belong to the same command. So a write that the
-    device refuses affects only one command.
+    device refuses affects only one command. The writes have the order of the items, because two
+    registers of a tag table may lie over the same bytes of the device.
 
     Args:
         items: Accepted items, oldest first.
@@ -171,20 +172,18 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
         for at, bits in enumerate(own, offset):
             taken[at] |= bits
         kept.append((items[place], own))
-    writes: list[Write] = []
-    image, bits_kept = bytearray(size), bytearray(size)
+    runs: list[tuple[int, int, list[bytes]]] = []  # offset, mask and pieces of the data of each write
     for _, group in groupby(reversed(kept), key=lambda pair: id(pair[0].command)):
-        ranges = []
+        end = -1  # offset after the last write of bytes; nothing is joined to a bit
         for item, own in group:
-            offset, stop = item.write.offset, item.write.offset + len(own)
-            ranges.append((offset, stop))
-            for part in item.parts():
-                apply(part, image)
-            for at, bits in enumerate(own, offset):
-                bits_kept[at] |= bits
-        writes += merge(image, bits_kept, ranges)
-        for start, stop in ranges:
-            bits_kept[start:stop] = bytes(stop - start)
+            offset, _, data = item.write
+            for at, mask, part in merge(data, own, [(0, len(own))]):
+                if mask or offset + at != end:
+                    runs.append((offset + at, mask, [part]))
+                else:
+                    runs[-1][2].append(part)
+                end = -1 if mask else offset + at + len(part)
+    writes = [Write(offset, mask, b"".join(pieces)) for offset, mask, pieces in runs]
     return writes, superseded
 
 

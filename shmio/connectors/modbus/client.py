@@ -18,6 +18,7 @@ a time-out.
 from __future__ import annotations
 
 import contextlib
+import logging
 import socket
 import time
 from collections.abc import Iterator
@@ -31,6 +32,8 @@ READ: Final = {Table.COIL: 1, Table.DISCRETE: 2, Table.HOLDING: 3, Table.INPUT: 
 WRITE_COIL, WRITE_WORD, WRITE_COILS, WRITE_WORDS, MASK_WORD = 5, 6, 15, 16, 22
 MAX_WRITE_WORDS: Final = 123
 MAX_WRITE_BITS: Final = 1968
+log = logging.getLogger("shmio.source")
+
 Framing = Literal["tcp", "rtu"]
 _READS: Final = frozenset(READ.values())
 _HEADER: Final = 7
@@ -85,6 +88,7 @@ class ModbusClient:
         self._answers = 0  # on the present connection
         self._answered = False  # at least once, on any connection
         self._closed_after = 0  # number of answers after which the device has closed a connection; 0: unknown
+        self._reconnected = False
         self.sent = False
         """True if any byte of the last write request may have left this host."""
 
@@ -119,7 +123,10 @@ class ModbusClient:
             raise self._explained(error) from None
 
     def _connect_again(self) -> None:
-        """Connect again, within the time-out of the present requests."""
+        """Connect again, within the time-out of the present requests; say so once in the log."""
+        if not self._reconnected:
+            self._reconnected = True
+            log.info("%s closes its connections; shmio opens a new one each time", self.peer)
         try:
             left_s = self._left_s(None)
         except TimeoutError as error:
@@ -303,7 +310,7 @@ class ModbusClient:
                 )
             self._receive(length, until_ns)
         except SilentError:
-            self._connect_again()
+            self._connect_again()  # an answer that comes late on the old connection is lost
             raise
         frame = bytes(self._received)
         self._received.clear()

@@ -413,6 +413,18 @@ def test_word_and_bit_of_two_commands_are_written_as_one_word(device: Device) ->
         assert device.get("holding", 4) == [1]
 
 
+def test_the_items_of_a_command_are_written_in_their_order(device: Device) -> None:
+    """Two registers may lie over the same word; the later item counts, wherever the registers are in the table."""
+    tags = {"byte": tag("BYTE", "holding 4"), "word": tag("WORD", "holding 4")}
+    with connected(device, tags) as (connector, layout):
+        for order, found in ((("word", 0x1234), ("byte", 7)), 0x1207), ((("byte", 7), ("word", 0x1234)), 0x1234):
+            writes = [one for path, value in order for one in encode(find(layout, path), value, "little")]
+            command = Command(1, 1, 1, 1 << 62, tuple(writes))
+            batch, _ = coalesce([Item(command, place) for place in range(len(writes))], layout.size)
+            assert connector.write(batch) == ["", ""]
+            assert device.get("holding", 4) == [found]
+
+
 def test_bits_of_two_commands_stay_two_requests(device: Device) -> None:
     device.set("holding", 4, [0b1000])
     with connected(device, {"word": tag("WORD", "holding 4")}) as (connector, layout):
