@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from typing import Final
 
 import msgspec
@@ -37,6 +38,7 @@ class Address(msgspec.Struct, frozen=True):
             raise ConfigError(f"{text!r}: write an IPv6 address in brackets, such as [::1]:8089")
         if not colon or not host or not port.isascii() or not port.isdecimal() or int(port) > 65535:
             raise ConfigError(f"{text!r} is not an address; expected host:port, such as 127.0.0.1:8089")
+        check_host(host)
         return cls(host, int(port))
 
     def __str__(self) -> str:
@@ -66,6 +68,25 @@ class Address(msgspec.Struct, frozen=True):
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return False
+
+
+_NUMERIC: Final = re.compile(r"[0-9]+(\.[0-9]+)+")
+
+
+def check_host(host: str) -> None:
+    """Refuse numbers with dots that are not an IPv4 address.
+
+    Raises:
+        ConfigError: The text is such. Whether a host has this name is not checked.
+
+    """
+    if _NUMERIC.fullmatch(host) and not _is_ipv4(host):
+        raise ConfigError(f"{host!r} is not an IP address; write four numbers from 0 to 255, such as 192.168.0.10")
+
+
+def _is_ipv4(text: str) -> bool:
+    parts = text.split(".")
+    return len(parts) == 4 and all(len(part) <= 3 and int(part) <= 255 for part in parts)
 
 
 class UnixAddress(msgspec.Struct, frozen=True):

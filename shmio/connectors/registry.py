@@ -11,14 +11,14 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from shmio.config.faults import explain
 from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.errors import ConfigError
-from shmio.wording import unknown
+from shmio.wording import brief, did_you_mean, unknown
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint, EntryPoints
@@ -102,6 +102,23 @@ def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist is not None else f"the package of {point.value}"
 
 
+_MEANT: Final = {
+    "simatic": "s7", "siemens": "s7", "step7": "s7", "tia": "s7", "profinet": "s7", "plc": "s7", "snap7": "s7",
+    "opc": "opcua", "ua": "opcua", "ros": "ros2", "dds": "ros2", "sparkplug": "mqtt", "fmu": "simulation",
+    "model": "simulation", "nats": "fabric", "mirror": "fabric",
+}  # fmt: skip
+"""What a name that begins so means: names of products and protocols that people write."""
+
+
+def _unknown(name: str) -> str:
+    """Return the message about a connector that does not exist, with the one that is meant, if that is clear."""
+    known = names()
+    folded = "".join(char for char in name.lower() if char.isalnum())
+    meant = {one: one for one in known} | _MEANT
+    found = next((meant[begin] for begin in sorted(meant, key=len, reverse=True) if folded.startswith(begin)), "")
+    return f"unknown connector {brief(name)}; {did_you_mean([found])}" if found else unknown("connector", name, known)
+
+
 def load(name: str) -> type[Connector] | type[Computed] | type[Replayed] | type[Mirrored]:
     """Import a connector by name.
 
@@ -117,7 +134,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed] | type[
         points = [point for point in _offered() if point.name == name]
         if not points:
             remedy = _SEPARATE.get(name)
-            raise ConfigError(f"connector {name!r} {remedy}" if remedy else unknown("connector", name, names()))
+            raise ConfigError(f"connector {name!r} {remedy}" if remedy else _unknown(name))
         if len(points) > 1:
             raise ConfigError(clash(name) or f"the package {_package(points[0])} offers the connector {name!r} twice")
         try:

@@ -6,7 +6,7 @@ import grp
 import os
 import pwd
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
@@ -221,6 +221,45 @@ def exposure(config: Config) -> str | None:
     )
 
 
+def open_doors(config: Config) -> Iterator[str]:
+    """Yield a line for each listener that serves clients without credentials although the configuration has some."""
+    grpc, mqtt, opcua = config.grpc, config.mqtt, config.opcua
+    guards = {
+        "[[grpc.token]]": grpc is not None and grpc.token,
+        "[[grpc.client]]": grpc is not None and grpc.client,
+        "token_file": any(section.token_file is not None for _, section in http_sections(config)),
+        "mqtt.password_file": mqtt is not None and mqtt.password_file is not None,
+        "[[opcua.account]]": opcua is not None and opcua.account,
+        "[[opcua.client]]": opcua is not None and opcua.client,
+        "opcua.trusted": opcua is not None and opcua.trusted,
+    }
+    given = [name for name, there in guards.items() if there]
+    for key, listen, what in _doors(config) if given else ():
+        yield f"note: {key}: clients without credentials may {what} at {listen}, although there is {_joined(given)}"
+
+
+def _doors(config: Config) -> Iterator[tuple[str, str, str]]:
+    """Yield (key, address, what clients without credentials may do) of each listener that other users can reach."""
+    grpc, mqtt, opcua, fabric = config.grpc, config.mqtt, config.opcua, config.fabric
+    for key, address in grpc.listening.items() if grpc else ():
+        asked = grpc is not None and grpc.tls is not None and grpc.tls.client_ca and encrypted(grpc, address)
+        if address.roles and not asked and not isinstance(parse_address(address.listen), UnixAddress):
+            yield key, address.listen, _joined(address.roles)
+    for name, section in http_sections(config):
+        if section.roles:
+            yield f"{name}.roles", section.listen, _joined(section.roles)
+    if opcua is not None and not opcua.trusted and (roles := _anonymous(opcua)):
+        yield "opcua.anonymous", opcua.listen, _joined(roles)
+    if mqtt is not None and mqtt.listen and not (mqtt.tls and mqtt.tls.ca):
+        roles = [role for account in mqtt.account if account.name is None for role in account.roles]
+        if find_mosquitto() is None:
+            yield "mqtt.listen", mqtt.listen, "publish everything, because aMQTT asks for no account"
+        elif roles or mqtt.password_file is None:
+            yield "mqtt.account", mqtt.listen, _joined(roles or ["read"])
+    if fabric is not None and fabric.embedded and fabric.allow and not (fabric.tls and fabric.tls.ca):
+        yield "fabric.allow", str(fabric.listen), "publish as the cells that it names"
+
+
 def other_users() -> list[str]:
     """Return the names of other users who can log in to this host, without root.
 
@@ -266,10 +305,15 @@ def _open_opcua(config: Config) -> Iterator[str]:
     opcua = config.opcua
     if opcua is None or opcua.trusted:
         return
-    guarded = bool(opcua.account or opcua.client)
-    given = opcua.anonymous if opcua.anonymous is not None else [] if guarded else ROLES
-    if roles := [role for role in given if role != "read"]:
+    if roles := [role for role in _anonymous(opcua) if role != "read"]:
         yield f"{_joined(roles)} by OPC UA at {opcua.listen}"
+
+
+def _anonymous(opcua: OpcUa) -> Sequence[str]:
+    """Return the roles of clients without account and certificate."""
+    if opcua.anonymous is not None:
+        return opcua.anonymous
+    return [] if opcua.account or opcua.client else ROLES
 
 
 def _open_fabric(config: Config) -> Iterator[str]:

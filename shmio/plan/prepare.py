@@ -7,7 +7,8 @@ load numpy, and no process of the instance starts before the plan is ready.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,8 @@ def prepare(
     layouts = sources.layouts
     if faults:
         _warn_besides(config, layouts, faults)
-    faults.raise_any()
+        if any(source.name not in layouts for source in config.source):
+            faults.raise_any()  # what follows needs the registers of all sources
     with faults.catching():
         config = _spelled(config, layouts)
     declared, described = dict[str, bytes](), tuple[str, ...]()
@@ -130,6 +132,7 @@ def prepare(
     ):  # a replay has other sources, and no alerts
         with faults.catching():
             _check_alert(f"alert[{index}]", alert, config, layouts)
+    faults.raise_any()
     odd = [*notices, *files.odd]
     for found in (
         lambda: _odd(config, layouts, faults),
@@ -413,9 +416,10 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
             glob = Glob(pattern)
         except PathError as error:
             raise ConfigError(f"{key}: {error}") from None
-        paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
+        paths = [f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers]
         if not any(map(glob.matches, paths)):
-            yield f"{key}: {pattern!r} matches no register; the path of a register begins with its source"
+            meant = did_you_mean(_wider(pattern, paths, *(f"{source}/" for source in layouts)))
+            yield f"{key}: {pattern!r} matches no register; {meant or 'the path of a register begins with its source'}"
 
 
 def _check_part(path: str, layouts: dict[str, Layout]) -> None:
@@ -471,8 +475,35 @@ def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
 
 
 def _near(pattern: str, layout: Layout) -> str:
-    names = [] if "*" in pattern else near(layout, pattern)
+    names = _wider(pattern, [one.path for one in layout.registers]) if "*" in pattern else near(layout, pattern)
     return f"; {did_you_mean(names)}" if names else ""
+
+
+MAX_TRIED = 32
+"""Maximum number of patterns that are tried in place of one that matches nothing."""
+
+
+def _wider(pattern: str, paths: Collection[str], *begins: str) -> list[str]:
+    """Return a pattern like one that matches nothing, which matches a path: with another number of levels.
+
+    Args:
+        pattern: The pattern.
+        paths: The paths that it could match.
+        begins: Texts that may be missing at its begin, such as the names of sources with a slash.
+    """
+    parts = pattern.split("/")
+    tried = [
+        *("/".join([*parts[:at], "**", *parts[at + 1 :]]) for at, part in enumerate(parts) if part == "*"),
+        "/".join("**" if part == "*" else part for part in parts),
+        *(begin + pattern for begin in begins),
+        f"**/{pattern}",
+        *("/".join(parts[at:]) for at in range(1, len(parts))),
+    ]
+    with suppress(PathError):
+        for wider in tried[:MAX_TRIED]:
+            if wider != pattern and set(wider) - set("*/") and any(map(Glob(wider).matches, paths)):
+                return [wider]
+    return []
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from urllib.parse import urlsplit
 
 import msgspec
 
 from shmio.config import Config, Source
+from shmio.config.address import check_host
 from shmio.config.faults import Faults
 from shmio.config.read import unknown_option
 from shmio.connectors import registry
@@ -82,6 +85,11 @@ def _check_source(
 ) -> None:
     key = f"source[{index}]"
     options = _options(key, source, faults)
+    for name, host in _hosts(source.options):
+        try:
+            check_host(host)
+        except ConfigError as error:
+            faults.add(f"{key}.{name}: {error}")
     try:
         connector = registry.load(source.connector)
     except ConfigError:  # reported with the options
@@ -130,6 +138,15 @@ def _check_source(
         made.close()
     if source.connector == "remote" and "outputs" in source.options:
         found.remote[source.name] = source.options["outputs"], source.options["inouts"]
+
+
+def _hosts(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield (key, host) for each host that a source's options name."""
+    if isinstance(host := options.get("host"), str):
+        yield "host", host
+    if isinstance(url := options.get("url"), str):
+        with suppress(ValueError):  # reported with the options
+            yield "url", urlsplit(url).hostname or ""
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,9 +10,12 @@ import msgspec
 
 from shmio.config import Declaration
 from shmio.config.masking import is_secret, mask_value
+from shmio.layout.model import Layout
+from shmio.layout.topic import shorten
 from shmio.plan.processes import Plan
 from shmio.segment import Block, BlockSpec, Quality, Segment
 from shmio.supervisor.fleet import Fleet, digest
+from shmio.wording import MAX_PATHS
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,13 +195,28 @@ def _text(value: Any) -> str:
 def _block_differences(old: BlockSpec, new: BlockSpec) -> Iterator[str]:
     """Yield the differences of a source's block that do not show in the source's keys."""
     if old.layout.hash != new.layout.hash:
-        before, after = ({one.path: one for one in block.layout.registers} for block in (old, new))
-        added, gone = after.keys() - before.keys(), before.keys() - after.keys()
-        moved = sum(before[path] != after[path] for path in before.keys() & after.keys())
-        counts = {"new": len(added), "gone": len(gone), "changed": moved}
-        yield f"registers: {', '.join(f'{count} {what}' for what, count in counts.items() if count) or 'none changed'}"
+        yield f"registers: {register_changes(old.layout, new.layout)}"
     if old.slots != new.slots:
         yield f"ring: {new.slots} frames instead of {old.slots}"
+
+
+def register_changes(old: Layout, new: Layout) -> str:
+    """Return which registers a new layout adds, removes and moves, and which it changes otherwise."""
+    before, after = ({one.path: one for one in layout.registers} for layout in (old, new))
+    kinds: dict[str, list[str]] = {
+        "added": [path for path in after if path not in before],
+        "gone": [path for path in before if path not in after],
+    }
+    for path in (path for path in before if path in after and before[path] != after[path]):
+        there = after[path]
+        place = msgspec.structs.replace(before[path], offset=there.offset, bit=there.bit, address=there.address)
+        kinds.setdefault("moved" if place == there else "changed", []).append(path)
+    parts = [f"{len(paths)} {what} ({_few(paths)})" for what, paths in kinds.items() if paths]
+    return ", ".join(parts) or "none changed"
+
+
+def _few(paths: Sequence[str]) -> str:
+    return f"{', '.join(map(shorten, paths[:MAX_PATHS]))}{', …' if len(paths) > MAX_PATHS else ''}"
 
 
 def _changed_injections(plan: Plan, running: Plan) -> Iterator[str]:

@@ -17,7 +17,7 @@ from shmio.logs import fields
 from shmio.plan.processes import Job, Plan
 from shmio.segment import Activity, Block, Segment
 from shmio.supervisor import policy
-from shmio.supervisor.changes import injection_changes, preview, reconcile, refusal
+from shmio.supervisor.changes import injection_changes, preview, reconcile, refusal, register_changes
 from shmio.supervisor.fleet import Fleet, brief, log
 from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
@@ -146,6 +146,12 @@ class InstanceChange:
         """
         self.plan = plan
         self.changes = reconcile(plan, segment.header.epoch, fleet, segment.blocks.values())
+        present = {block.source: block.layout for block in segment.blocks.values()}
+        self._layouts = [
+            f"{spec.source}: registers: {register_changes(present[spec.source], spec.layout)}"
+            for spec in self.changes.add
+            if spec.source in present and present[spec.source].hash != spec.layout.hash
+        ]
         self._unwell = {managed.name for managed in fleet if not managed.well}
         self._fleet = fleet
         self._segment = segment
@@ -246,7 +252,7 @@ class InstanceChange:
             else:
                 why = managed.life.note or managed.life.state.value
                 problems.append(f"{job.name}: {how}, but it is not running: {why}")
-        return done, problems
+        return done + self._layouts, problems
 
 
 class _PendingPlan:

@@ -82,7 +82,10 @@ def test_registers_come_and_go_over_the_same_connection(plant: Plant) -> None:
     with shmio.attach(plant.cell.instance) as reader:
         held = reader.block("pumps")
         plant.table(LEVEL, SPEED)
-        assert plant.reload("--dry-run")[0] == "would keep the connection of pumps: registers: 1 new, 1 changed"
+        assert (
+            plant.reload("--dry-run")[0]
+            == "would keep the connection of pumps: registers: 1 added (Level), 1 moved (Speed)"
+        )
         assert reader.block("pumps") is held
         assert plant.reload()[0] == SAME
         assert held.retired

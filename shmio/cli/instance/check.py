@@ -15,6 +15,7 @@ from shmio.config import Address, Alert, Source
 from shmio.connectors.request_count import Requests
 from shmio.errors import AlreadyRunningError, ConfigError, ShmioError
 from shmio.layout.topic import shorten
+from shmio.plan.host import open_doors
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
@@ -48,7 +49,7 @@ def check(arguments: argparse.Namespace) -> int:
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
-        "notes": [*prepared.notes, *_unserved(prepared), *would_fail],
+        "notes": [*prepared.notes, *open_doors(prepared.config), *_unserved(prepared), *would_fail],
         "warnings": [*plan.warnings, *map(prepared.warning, slow)],
     }
     if prepared.config.replay and prepared.config.replay.file:

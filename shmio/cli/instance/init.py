@@ -190,6 +190,8 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
     number = properties.get("dbNumber", "")
     program = read_program(sources)
     blocks, warnings = _compile(program, name, number)
+    if not emulated and name is None and not number:  # else the user has chosen, and gets a warning
+        blocks, warnings = _readable(blocks, warnings, file)
     paths = [_relative(path, file) for path in sources]
     layout = f"layout = {_toml(paths if len(paths) > 1 else paths[0])}"
     held = ", ".join(block.name for block in program.blocks) if len(program.blocks) > 1 else ""
@@ -269,6 +271,26 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
     if not found:
         raise refused[0]
     return found, warnings + [f"left out: {why.diagnostics[0]}" for why in refused]
+
+
+def _readable(blocks: Sequence[Layout], warnings: list[str], file: Path) -> tuple[list[Layout], list[str]]:
+    """Return the blocks that the connector s7 can read, and the warnings, with those about the others.
+
+    Raises:
+        ConfigError: It can read none of them.
+
+    """
+    found = [block for block in blocks if not block.optimized]
+    others = ", ".join(block.name for block in blocks if block.optimized)
+    if not found:
+        raise ConfigError(
+            f"{others}: the connector s7 cannot read data blocks with optimized access; switch off 'Optimized block "
+            "access' in the block's properties, compile and load it, and generate its source anew; or read it by OPC "
+            f'UA: write a [[source]] with connector = "opcua" and nodes = "siemens" into {file}; '
+            "--block NAME takes it as it is"
+        )
+    left_out = [f"left out: {others}, because the connector s7 cannot read optimized access"] if others else []
+    return found, [*warnings, *left_out]
 
 
 def _refuse_table(path: Path, file: Path) -> None:

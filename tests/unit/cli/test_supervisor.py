@@ -154,6 +154,33 @@ def test_init_does_not_write_through_a_dangling_link(capsys: pytest.CaptureFixtu
     assert not Path("elsewhere.toml").exists()
 
 
+BLOCK = """DATA_BLOCK "{name}"
+{{ S7_Optimized_Access := '{optimized}' }}
+VERSION : 0.1
+   STRUCT
+      a : Int;
+   END_STRUCT;
+BEGIN
+END_DATA_BLOCK
+"""
+
+
+def test_init_chooses_no_block_that_its_connector_cannot_read(capsys: pytest.CaptureFixture[str]) -> None:
+    fast, slow = BLOCK.format(name="Fast", optimized="TRUE"), BLOCK.format(name="Slow", optimized="FALSE")
+    Path("both.scl").write_text(fast + slow)
+    Path("fast.db").write_text(fast)
+    assert main(["init", "-c", "both.toml", "both.scl"]) == 0
+    assert "left out: Fast, because the connector s7 cannot read optimized access" in capsys.readouterr().err
+    assert re.findall(r'block = "(.*?)"', Path("both.toml").read_text()) == ["Slow"]
+    assert main(["init", "-c", "fast.toml", "fast.db"]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("Fast: the connector s7 cannot read data blocks with optimized access; switch off")
+    assert not Path("fast.toml").exists()
+    assert main(["init", "-c", "fast.toml", "fast.db", "--block", "Fast"]) == 0, "the user has chosen it"
+    assert "optimized access" in capsys.readouterr().err
+    assert main(["init", "-c", "emulated.toml", "fast.db", "--emulated"]) == 0
+
+
 def test_init_from_the_files_of_the_java_version(capsys: pytest.CaptureFixture[str]) -> None:
     Path("plc.ini").write_text(
         "model=S7_1500\nhost=10.76.0.12\nport=102\nrack=0\nslot=1\npacketSize=96\ndbNumber=201\n"
