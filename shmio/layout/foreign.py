@@ -31,10 +31,12 @@ _INSTEAD: Final = (
     ".db file that it writes"
 )
 _CONVERT: Final = "'shmio-layout import' makes a tag table of it; for a data block, "
-_MICROWIN: Final = re.compile(r"^[ \t]*V[BWD]?[0-9]{1,5}(?:\.[0-7])?[ \t]+[^\s:]", re.MULTILINE)
+_MICROWIN: Final = re.compile(r"DATA PAGE COMMENTS|^[ \t]*V[BWD]?[0-9]{1,5}(?:\.[0-7])?[ \t]+[^\s:]", re.MULTILINE)
 _MEMBERS: Final = re.compile(r"\b(?:STRUCT|VAR|VAR_INPUT|VAR_OUTPUT)\b", re.IGNORECASE)
 _MC7_MAGIC: Final = b"pp"
-_MC7_TEXT: Final = re.compile(r"\s*(?:0x)?70[\s,]*(?:0x)?70(?:[\s,]*(?:0x)?[0-9A-Fa-f]{2}){6}")
+_MC7_TEXT: Final = re.compile(
+    r"\s*(?:[0-9A-Fa-f]{4,8}:?\s+)?(?:0x)?70[\s,]*(?:0x)?70(?:[\s,]*(?:0x)?[0-9A-Fa-f]{2}){6}"
+)
 _ZIP: Final = b"PK\x03\x04"
 _OLD_OFFICE: Final = b"\xd0\xcf\x11\xe0"
 _CONTROLS: Final = bytes({*range(32)} - {*b"\t\n\f\r"})

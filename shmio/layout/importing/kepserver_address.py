@@ -43,6 +43,8 @@ NUMBERS: Final = {
 """Types of numbers in KEPServerEX, and their S7 names."""
 KINDS: Final = {"boolean": "BOOL", "string": "STRING", **NUMBERS}
 _SHAPE: Final = re.compile(r"(?P<place>[^\[\]]*?)\s*(?P<counts>(?:\[\s*[0-9]{1,6}\s*\]\s*){0,3})")
+_OTHER: Final = "the address {!r} is not one of a Modbus device or S7 controller"
+_MAX_ADDRESS: Final = 100  # characters
 _MAX_TEXT: Final = 240  # characters of a text in Modbus
 _MODBUS: Final = re.compile(
     r"(?:(?P<hex>H)?(?P<table>[0134])(?P<item>[0-9A-F]{1,5}))(?:\.(?P<part>[0-9]{1,3})(?P<text>[HL]?))?"
@@ -79,9 +81,9 @@ def translate(address: str, data_type: str) -> Place:
     kind, _, array = data_type.strip().lower().partition(" ")
     if array not in ("", "array") or (kind not in KINDS and kind != "default"):
         raise ValueError(f"the type {data_type!r} has no counterpart")
-    shape = _SHAPE.fullmatch(address.strip())
+    shape = _SHAPE.fullmatch(address.strip()) if len(address) <= _MAX_ADDRESS else None
     if shape is None:
-        raise ValueError(f"the address {address!r} is not one of a Modbus device or S7 controller")
+        raise ValueError(_OTHER.format(address[:_MAX_ADDRESS]))
     counts = [int(count) for count in re.findall(r"[0-9]+", shape["counts"])]
     if len(counts) > 2 or not all(counts):
         raise ValueError(f"{address!r}: expected one or two lengths from 1 on, as in [10] or [2][3]")
@@ -97,13 +99,13 @@ def translate(address: str, data_type: str) -> Place:
         return _in_s7(address, match, kind, dims)
     if (match := _NUMBERED.fullmatch(place)) is not None and not dims:
         return _numbered(address, match, kind)
-    raise ValueError(f"the address {address!r} is not one of a Modbus device or S7 controller")
+    raise ValueError(_OTHER.format(address[:_MAX_ADDRESS]))
 
 
 def _in_modbus(address: str, match: re.Match[str], kind: str, dims: Dims) -> Place:
     digits, part, is_bit = match["item"], match["part"], match["table"] in "01"
     if not match["hex"] and not digits.isdecimal():
-        raise ValueError(f"the address {address!r} is not one of a Modbus device or S7 controller")
+        raise ValueError(_OTHER.format(address[:_MAX_ADDRESS]))
     item = int(digits, 16 if match["hex"] else 10)
     if not 1 <= item <= 65_536:
         raise ValueError(f"{address!r}: the number must be from 1 to 65536")

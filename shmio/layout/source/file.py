@@ -15,6 +15,7 @@ from typing import Final
 from shmio.layout.encodings import UTF_16, codec
 
 _MARKS = ((codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+_PROBED_BYTES: Final = 1 << 16
 _HIGH: Final = re.compile(rb"[\x80-\xff]+")
 _NEWLINE = re.compile(r"\r\n|\r|\n")
 _AS_WINDOWS = (
@@ -89,7 +90,8 @@ def _is_eastern(data: bytes) -> bool:
 
     A letter with an accent in the text of a Western code page stands alone or beside one other.
     """
-    runs = _HIGH.findall(data)
+    head = data[:_PROBED_BYTES]
+    runs = _HIGH.findall(head[: head.rfind(b"\n") + 1] if len(head) < len(data) else head)
     pairs = [run[at : at + 2] for run in runs for at in range(0, len(run), 2)]
     common = sum(0xB0 <= pair[0] <= 0xD7 and pair[-1] >= 0xA1 for pair in pairs)
     return len(pairs) > 1 and all(len(run) % 2 == 0 for run in runs) and common * 5 >= len(pairs) * 4

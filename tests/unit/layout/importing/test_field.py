@@ -481,6 +481,8 @@ def test_other_programs_are_refused_by_their_names(tmp_path: Path) -> None:
     for name, data, what in (
         ("b.awl", (FIELD / "s7/microwin.awl").read_bytes(), "STEP 7-Micro/WIN"),
         ("b.mc7", b"pp\x01\x01\x02\x0a\x00\x05\x00\x00" + bytes(60), "MC7"),
+        ("b.txt", b"00000000: 7070 0101 020a 0005 0000 0120\n", "MC7"),
+        ("b.awl", b"DATA_BLOCK\n//DATA PAGE COMMENTS\n//\nEND_DATA_BLOCK\n", "STEP 7-Micro/WIN"),
         ("b.txt", b"70 70 01 01 02 0a 00 05 00 00 01 20 00\n", "MC7"),
         (
             "b.awl",
