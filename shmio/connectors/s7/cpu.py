@@ -19,7 +19,8 @@ from shmio.connectors.s7.explain import ACCESS_DENIED, RefusedError, names_of
 from shmio.connectors.s7.mode import MODES, ModeQuery
 from shmio.connectors.s7.query import Query
 from shmio.connectors.s7.userdata import READ_CLOCK, READ_SZL, Service, parse_clock, szl_data, szl_records
-from shmio.layout.model import INTEGERS, Register
+from shmio.layout.encodings import WINDOWS_1252, text_encoding
+from shmio.layout.model import INTEGERS, Register, is_encoded
 from shmio.layout.s7.address import CPU
 from shmio.layout.values.codec import Value
 from shmio.model.statuses import (
@@ -229,15 +230,15 @@ class _TextsQuery(_CpuQuery):
             records.setdefault(int.from_bytes(record[:2], "big"), record)
         self.note(
             self.tags,
-            lambda tag: _text(tag.name, records),
+            lambda tag: _text(tag, records),
             BAD_NO_DATA,
             f"list 0x{self._szl:04X} of the CPU does not contain this value",
         )
 
 
-def _text(name: str, records: Mapping[int, bytes]) -> str | None:
-    """Return the text ``name`` from records by their numbers; None if they do not contain the text."""
-    place = _TEXTS[name]
+def _text(tag: CpuTag, records: Mapping[int, bytes]) -> str | None:
+    """Return a tag's text from records by their numbers; None if they do not contain the text."""
+    name, place = tag.name, _TEXTS[tag.name]
     record = records.get(place.record, b"")
     if name == "firmware":
         version = record[place.start : place.start + 4]
@@ -245,7 +246,8 @@ def _text(name: str, records: Mapping[int, bytes]) -> str | None:
     field = record[place.start : place.start + place.length]
     if len(record) < place.start + place.length:
         return None
-    return field.partition(b"\0")[0].decode("latin-1").strip()
+    encoding = tag.register.encoding or ("" if is_encoded(tag.register.type) else WINDOWS_1252)
+    return text_encoding(encoding).decode(bytes(field.partition(b"\0")[0])).strip()
 
 
 class _ClockQuery(_CpuQuery):

@@ -84,6 +84,22 @@ def test_another_layout_than_the_owners_is_refused(tmp_path: Path, server: NatsS
         plan(tmp_path, server.url, other)
 
 
+def test_the_owner_knows_the_encoding_of_its_texts(tmp_path: Path, server: NatsServer, owner: BlockSpec) -> None:
+    """Also an owner of a version that stored no encodings; a key of the mirror counts."""
+    text = BLOCK.replace("Level : Real", "Level : String[2]")
+    (tmp_path / "cell.db").write_text(text)
+    for more, wanted in {'encoding = "gbk"\n': "gbk", 'encoding = "iso-8859-1"\n': ""}.items():
+        (tmp_path / "owner.toml").write_text(SOURCE + more)
+        (owner,) = prepare(tmp_path / "owner.toml").plan.blocks
+        offer(server, owner)
+        (mirror,) = plan(tmp_path, server.url, text).blocks
+        assert wanted in {one.encoding for one in mirror.layout.registers}
+        assert mirror.layout.hash == owner.layout.hash
+    (tmp_path / "far.toml").write_text((tmp_path / "far.toml").read_text() + 'encoding = "cp949"\n')
+    with pytest.raises(ConfigError, match="has another layout"):
+        prepare(tmp_path / "far.toml")
+
+
 def test_the_owners_table_makes_nothing_writable_here(tmp_path: Path, server: NatsServer) -> None:
     table = '[registers]\nlamp = { type = "BOOL", writable = true }\nspeed = { type = "REAL", writable = true }\n'
     (tmp_path / "belt.toml").write_text(table)
