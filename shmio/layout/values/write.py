@@ -36,7 +36,8 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
     """Return the writes that set a register, or a part of a register, to a value.
 
     A slice of bits may need several writes, anything else needs one. An array of bits is written as
-    whole bytes, because no other register uses the rest of a row's last byte.
+    whole bytes, because no other register of the block uses the rest of a row's last byte. In a
+    device, something else may use it: a connector writes only the :func:`element_bits`.
 
     Raises:
         ValueRangeError: The value does not fit the register.
