@@ -6,6 +6,7 @@ import asyncio
 import logging
 import time
 from collections import deque
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -31,6 +32,8 @@ CONFIRM_S: Final = 0.1
 LIVE_NS: Final = 1_000_000_000
 """If the next message is older than this, in ns, newer messages pass it, and it follows as late."""
 CONFIRM_TIMEOUT_S: Final = 5.0
+TURN_BYTES: Final = 128 << 10
+"""What is sent of an answer before another one has its turn, in bytes."""
 
 log = logging.getLogger("shmio.fabric")
 
@@ -67,6 +70,7 @@ class Publisher:
         self._unconfirmed: deque[_Sent] = deque()
         self._unconfirmed_bytes = 0
         self._tasks: list[asyncio.Task[None]] = []
+        self._turns = asyncio.Lock()  # the longest waiting one is the next
         self._errors = library("nats.errors", INSTALL)
 
     @property
@@ -208,7 +212,10 @@ class Publisher:
     # ---- requests for missing messages -------------------------------------------------------------------------------
 
     async def answer(self, row: Row | None, message: Msg) -> None:
-        """Answer a request for missing messages, and end the answer with an empty message."""
+        """Answer a request for missing messages, and end the answer with an empty message.
+
+        Answers take turns, so that a reader who asks for much delays others by little.
+        """
         if not wants_reply(message) or self._client is None:
             return
         client = self._client
@@ -216,20 +223,28 @@ class Publisher:
             wanted = msgspec.json.decode(message.data, type=MissingRequest)
         except msgspec.MsgspecError:
             wanted = MissingRequest(0, 0, 0)
+        known = row is not None and row.stream == wanted.stream
+        numbers = iter(row.between(wanted.first, wanted.last) if row is not None and known else ())
         with suppress(self._errors.Error, TimeoutError):
-            size = 0
-            if row is not None and row.stream == wanted.stream:
-                for number in row.between(wanted.first, wanted.last):
-                    kept = row.find(number)
-                    if kept is None:
-                        continue
-                    await client.publish(message.reply, aged(kept))
-                    size += kept.size
-                    if size >= LATE_BYTES // 2:
-                        async with asyncio.timeout(CONFIRM_TIMEOUT_S):
-                            await client.confirm()
-                        size = 0
+            more = row is not None
+            while more and row is not None:
+                async with self._turns:
+                    more = await self._send_some(client, message.reply, row, numbers)
             await client.publish(message.reply, b"")
+
+    async def _send_some(self, client: FabricClient, reply: str, row: Row, numbers: Iterator[int]) -> bool:
+        """Send the next messages of an answer, and return whether there are more."""
+        size = 0
+        for number in numbers:
+            if (kept := row.find(number)) is None:
+                continue
+            await client.publish(reply, aged(kept))
+            size += kept.size
+            if size >= TURN_BYTES:
+                async with asyncio.timeout(CONFIRM_TIMEOUT_S):
+                    await client.confirm()
+                return True
+        return False
 
 
 def aged(kept: Kept) -> bytes:

@@ -110,6 +110,8 @@ class Uplink:
             self._feeds,
         )
         self._replies: set[asyncio.Task[None]] = set()
+        self._asking: set[str] = set()
+        """The subjects to which answers to requests for missing messages are being sent."""
         self._errors = library("nats.errors", INSTALL)
         stored = library("nats.js.errors", INSTALL)
         self._gone = stored.NoStreamResponseError, stored.NotFoundError
@@ -436,13 +438,24 @@ class Uplink:
 
     async def _on_missing(self, message: Msg) -> None:
         source = source_of(message.subject.split(".")[4])
-        await self.publisher.answer(self.backlog.rows.get(source), message)
+        reply = message.reply
+        if reply not in self._asking and len(self._asking) < MAX_REQUESTS:  # each reader waits for an answer's end
+            self._asking.add(reply)
+            answer = asyncio.get_running_loop().create_task(
+                self.publisher.answer(self.backlog.rows.get(source), message)
+            )
+            self._replies.add(answer)
+            answer.add_done_callback(partial(self._answered, reply))
         if (feed := self._feeds.get(source)) is None or not asks_for_state(message.data):
             return
         state = self.commands.client(feed).state
         if not state.wanted:
             state.wanted = True
             self._poll_on(feed)
+
+    def _answered(self, reply: str, answer: asyncio.Task[None]) -> None:
+        self._replies.discard(answer)
+        self._asking.discard(reply)
 
     async def _on_command(self, message: Msg) -> None:
         if is_stored(message):
