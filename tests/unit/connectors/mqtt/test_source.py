@@ -240,6 +240,9 @@ def test_writes_that_are_refused(plant: Plant) -> None:
         plant.device.ask("subscribe", "w/list/set")
         assert write(source.connector, [element]) == [""]
         assert plant.device.ask("next", "w/list/set")["payload"] == '{"v":[1,5,3]}'
+        (other,) = encode(source.layout.element(array, (3,)), 6, source.layout.byte_order)
+        assert write(source.connector, [other]) == [""]  # before the device has sent its array again
+        assert plant.device.ask("next", "w/list/set")["payload"] == '{"v":[1,5,6]}'
 
 
 def _write_to_nobody(plant: Plant) -> str:
