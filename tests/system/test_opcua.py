@@ -61,6 +61,7 @@ def check(cell: Cell, found: dict[str, object]) -> None:
     assert found["status"] == "Good"
     assert found["path"] == "ns=2;s=cell/Robot_800"
     assert found["change"] == "seen"
+    assert (found["part"], found["beyond"]) == ([2, 1, "Good", 7, 9], "BadIndexRangeNoData")
     assert (found["written"], found["refused"], found["unknown"]) == ("Good", "BadNotWritable", "BadNodeIdUnknown")
 
 

@@ -4,6 +4,7 @@
 
 const opcua = require('node-opcua-client');
 const { OPCUACertificateManager } = require('node-opcua-certificate-manager');
+const { NumericRange } = require('node-opcua-numeric-range');
 
 const [url, folder, instance, userName, password] = process.argv.slice(2);
 const { AttributeIds, MessageSecurityMode, SecurityPolicy, UserTokenType } = opcua;
@@ -58,6 +59,15 @@ async function main() {
     value: { value: { dataType, value } } })).name;
   result.written = await write('ns=2;s=cell/Outputs/13', opcua.DataType.Byte, 1);
   result.change = await seen;
+  // Parts of an array, by index ranges.
+  const part = { nodeId: 'ns=2;s=cell/Outputs', attributeId: AttributeIds.Value, indexRange: new NumericRange('13:14') };
+  const before = (await session.read(part)).value.value;
+  const dataType = opcua.DataType.Byte;
+  const status = await session.write({ ...part, value: { value: { dataType, arrayType: 1, value: Buffer.from([7, 9]) } } });
+  result.part = [before.length, before[0], status.name, ...(await session.read(part)).value.value];
+  await session.write({ ...part, value: { value: { dataType, arrayType: 1, value: before } } });
+  const beyond = { ...part, indexRange: new NumericRange('9999') };
+  result.beyond = (await session.read(beyond)).statusCode.name;
   result.refused = await write('ns=2;s=cell/Robot_800/Axs1_Pos', opcua.DataType.Float, 1.5);
   result.unknown = await write('ns=2;s=cell/nothing', opcua.DataType.Float, 1.5);
   // The cell is paused now: its registers stay the same, apart from its cycle counter.
