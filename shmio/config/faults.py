@@ -273,6 +273,8 @@ def explain_toml(error: Exception, text: str) -> str:
     """Return the TOML parser's message, the text of the faulty line and, for frequent mistakes, the remedy."""
     if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() refuses so many digits
         return "a number has too many digits"
+    if isinstance(error, RecursionError):
+        return "tables and lists are nested too deeply"
     place = _POSITION.search(str(error))
     if place is None:
         return str(error)

@@ -19,6 +19,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from shmio.audit import trail
+from shmio.endpoints.turns import Turns
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.metrics import Exposition, InstanceCollector
 from shmio.endpoints.web.page import Page, Tab
@@ -71,7 +72,7 @@ def metrics_app(
     async def hint(_request: Request) -> Response:
         return PlainTextResponse(_HINT)
 
-    return Starlette(routes=[_metrics(segment, measurements, folders, registers, refuse), Route("/", hint)])
+    return Starlette(routes=[_metrics(segment, measurements, folders, registers, refuse, Turns()), Route("/", hint)])
 
 
 def _metrics(
@@ -80,13 +81,15 @@ def _metrics(
     folders: Mapping[str, str],
     registers: Sequence[str],
     refuse: Callable[[Request], Awaitable[Response | None]],
+    turns: Turns,
 ) -> Route:
     exposition = Exposition(InstanceCollector(segment, measurements, folders, registers))
 
     async def metrics(request: Request) -> Response:
         if (refused := await refuse(request)) is not None:
             return refused
-        return Response(await run_in_threadpool(exposition.answer), media_type=CONTENT_TYPE_LATEST)
+        async with turns.of(request.headers.get("authorization") or _host(request)):
+            return Response(await run_in_threadpool(exposition.answer), media_type=CONTENT_TYPE_LATEST)
 
     return Route("/metrics", metrics)
 
@@ -154,7 +157,14 @@ class PageApp:
 
         """
         routes: list[BaseRoute] = [
-            _metrics(self._served.segment, measurements, self._served.folders, registers, self._refuse_metrics),
+            _metrics(
+                self._served.segment,
+                measurements,
+                self._served.folders,
+                registers,
+                self._refuse_metrics,
+                self._served.turns,
+            ),
             Route("/session", self._session, methods=["GET", "POST", "DELETE"]),
             Route("/layout", self._layout, methods=["POST"]),
             WebSocketRoute("/socket", self._socket),
@@ -207,13 +217,16 @@ class PageApp:
 
     async def _layout(self, request: Request) -> Response:
         """Return the registers in files that the user has dropped on the page. The files are not stored."""
-        if "read" not in self._user(request).roles:
+        user = self._user(request)
+        if "read" not in user.roles:
             return JSONResponse({"error": "this needs the role read; sign in"}, 403)
         try:
             body = await self._uploads.receive(request.stream())
             if body is None:
                 return JSONResponse({"error": f"these files have more than {MAX_BYTES >> 20} MB"}, 413)
-            return Response(await _while_connected(request, self._uploads.compile(body)), media_type="application/json")
+            return Response(
+                await _while_connected(request, self._uploads.compile(body, user.client)), media_type="application/json"
+            )
         except ClientDisconnect:
             return Response(status_code=400)  # nobody reads it
         except EndpointError as error:

@@ -32,6 +32,8 @@ MAX_CALLS: Final = 16
 """Maximum number of a page's calls that may be in progress. Further calls wait."""
 MAX_BATCHES: Final = 32
 """Maximum number of binary messages that wait for a page. If there are more, the oldest are dropped."""
+FOLLOW_S: Final = 0.02
+"""Least time in s between two requests of a page to follow a tab, because each one causes data to be sent at once."""
 CLOSE_S: Final = 1.0
 """Time in s for which a page that is being closed waits for its client to read the reason."""
 FIRST_CALL_S: Final = 10.0
@@ -102,6 +104,8 @@ class Tab:
 
     name: ClassVar[str]
     calls: ClassVar[Mapping[str, Call]]
+    takes_turns: ClassVar[bool] = True
+    """Whether the calls that only read wait for the client's turn. It is false if their work has another limit."""
 
     def __init_subclass__(cls) -> None:
         """Collect the calls of the class."""
@@ -130,11 +134,15 @@ class FollowedTab(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._following: asyncio.Task[None] | None = None
+        self._followed_s = 0.0
 
     @call("read", Nothing)
     async def follow(self, _: Nothing) -> None:
         """Send the tab's data now, and again whenever it changes, until :meth:`leave`."""
         await self.leave(_)
+        now_s = asyncio.get_running_loop().time()
+        await asyncio.sleep(self._followed_s + FOLLOW_S - now_s)  # returns at once if the time is over
+        self._followed_s = asyncio.get_running_loop().time()
         self._following = self.page.start(self._follow())
 
     @call("read", Nothing)
@@ -279,13 +287,12 @@ class Page:
     async def _answer(self, text: str) -> None:
         """Carry out the call in a message, and send the answer."""
         number = 0
-        answer: dict[str, object]
         try:
             try:
                 message = msgspec.json.decode(text, type=_Message)
                 number = message.id
                 made, tab = self._calls.get(message.call, (None, None))
-                if made is None:
+                if made is None or tab is None:
                     raise ShmioError(f"unknown call {message.call[:80]!r}")
                 attempt = None if made.role == "read" else self._attempt(message)
                 if made.role not in self.user.roles:
@@ -295,20 +302,23 @@ class Page:
                 arguments = msgspec.json.decode(message.arguments, type=made.arguments)
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
                 raise ShmioError(f"the call is malformed: {error}") from None
-            with attempt or nullcontext():
-                result = await made.function(tab, arguments)
-                if attempt is not None:
-                    attempt.end(*_outcome(result))
-            answer = {"id": number, "result": result}
+            in_turn = made.role == "read" and (tab.takes_turns or message.call.endswith(".follow"))
+            async with self.served.turns.of(self.user.client) if in_turn else nullcontext():
+                with attempt or nullcontext():
+                    result = await made.function(tab, arguments)
+                    if attempt is not None:
+                        attempt.end(*_outcome(result))
+                answer = msgspec.json.encode({"id": number, "result": result})
         except ShmioError as error:
-            answer = {"id": number, "error": str(error)}
+            answer = msgspec.json.encode({"id": number, "error": str(error)})
         except asyncio.CancelledError:
             raise
         except Exception as error:  # noqa: BLE001  the page gets an answer to each call
             # An error of the operating system, such as that no descriptor is free, is no error in the program.
             _log.error("a call of a page failed: %s", error, exc_info=not isinstance(error, OSError))
-            answer = {"id": number, "error": "the server failed to do this; its log has the reason"}
-        self._answers.append(msgspec.json.encode(answer))
+            text = "the server failed to do this; its log has the reason"
+            answer = msgspec.json.encode({"id": number, "error": text})
+        self._answers.append(answer)
         self._waiting.set()
 
     def _denial(self, role: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.endpoints.alerts.state_file import alert_states
+from shmio.endpoints.turns import Turns
 from shmio.endpoints.web.cells import Cells
 from shmio.endpoints.web.clients import clients
 from shmio.endpoints.web.configuration import ConfigurationFile
@@ -84,6 +85,8 @@ class Served:
         self.recordings = Recordings(recordings)
         self.cells = None if fabric is None else Cells(fabric, segment.instance)
         """The cells of the fabric; None without a fabric."""
+        self.turns = Turns()
+        """The turns of the clients whose pages make calls."""
         self.messages = self.bytes = 0
         """Numbers of messages and bytes that were sent to pages."""
         self._overview: dict[str, Any] = {}

@@ -7,17 +7,19 @@ time and memory. No file is written.
 from __future__ import annotations
 
 import asyncio
+import os
 import resource
 import signal
 import sys
 from collections.abc import AsyncIterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from pathlib import PurePath
 from typing import Annotated, Any, Final
 
 import msgspec
 from msgspec import Meta
 
+from shmio.endpoints.turns import Turns
 from shmio.errors import CommandError, EndpointError, LayoutError
 from shmio.layout.compiler import SUFFIXES as SOURCES
 from shmio.layout.compiler import Source, compile_sources
@@ -49,6 +51,8 @@ LIMIT_S: Final = 30
 """Maximum time in s that compiling files may take."""
 MEMORY_BYTES: Final = 1 << 30
 """Maximum address space of the process that compiles, in bytes."""
+NICENESS: Final = 10
+"""How much the process that compiles yields to others, such as the sources: nice(2)."""
 
 _Name = Annotated[str, Meta(min_length=1, max_length=255)]
 _Bytes = Annotated[int, Meta(ge=0, le=MAX_BYTES)]
@@ -72,6 +76,7 @@ class Uploads:
         """The uploads that are being received, the oldest first."""
         self._number = 0
         self._compiling = asyncio.Semaphore(MAX_COMPILING)
+        self._turns = Turns(1)
 
     async def receive(self, parts: AsyncIterable[bytes]) -> bytes | None:
         """Receive an upload, and return it whole; None if it is too large.
@@ -96,23 +101,24 @@ class Uploads:
         finally:
             self._receiving.pop(number, None)
 
-    async def compile(self, body: bytes) -> bytes:
+    async def compile(self, body: bytes, client: str) -> bytes:
         """Compile an upload as :func:`compile_uploads` does. Wait first while too many others are being compiled.
+
+        The uploads of one client are compiled one after the other, so that others find room.
 
         Raises:
             CommandError: Compiling took too much time or memory.
             EndpointError: Others took too long.
 
         """
-        try:
-            async with asyncio.timeout(WAIT_S):
-                await self._compiling.acquire()
-        except TimeoutError:
-            raise EndpointError("other files are being read; try again") from None
-        try:
+        async with AsyncExitStack() as stack:
+            try:
+                async with asyncio.timeout(WAIT_S):
+                    await stack.enter_async_context(self._turns.of(client))
+                    await stack.enter_async_context(self._compiling)
+            except TimeoutError:
+                raise EndpointError("other files are being read; try again") from None
             return await compile_uploads(body)
-        finally:
-            self._compiling.release()
 
 
 async def compile_uploads(body: bytes) -> bytes:
@@ -249,6 +255,7 @@ def _short(text: str) -> str:
 
 def main() -> None:
     """Read an upload from standard input, and write the answer to standard output."""
+    os.nice(NICENESS)
     signal.alarm(2 * LIMIT_S)  # ends this process even if its parent has died
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))

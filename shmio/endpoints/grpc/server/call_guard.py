@@ -32,6 +32,7 @@ from shmio.endpoints.grpc.server.access import (
     host_of,
 )
 from shmio.endpoints.grpc.server.error_status import Context
+from shmio.endpoints.turns import Turns
 from shmio.endpoints.wrong_tokens import WrongTokens
 from shmio.errors import EndpointError
 from shmio.layout.topic import shorten
@@ -138,6 +139,7 @@ class OpenCalls:
         self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
         self.wrong = WrongTokens()
+        self.turns = Turns()
         self.sent_bytes = 0
         """Size of all messages that were sent to clients, without the framing of gRPC and HTTP/2."""
         self._open: set[_Call] = set()
@@ -273,7 +275,10 @@ class CallGuard:
                 elif decode is not None:
                     request = _decoded(method, decode, messages, context)
                 if not many:
-                    return await behaviour(request, context)
+                    if handler.request_streaming or NEEDS.get(method) != READ:
+                        return await behaviour(request, context)
+                    async with self._calls.turns.of(call.client):
+                        return await behaviour(request, context)
                 async with aclosing(behaviour(request, context)) as responses:
                     async for response in responses:
                         await context.write(response)

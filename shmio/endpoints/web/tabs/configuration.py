@@ -32,6 +32,7 @@ class Configuration(FollowedTab):
     """Shows the configuration file, and reloads it. It never changes the file."""
 
     name: ClassVar[str] = "configuration"
+    takes_turns: ClassVar[bool] = False
 
     def __init__(self, page: Page) -> None:
         super().__init__(page)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
@@ -16,8 +16,9 @@ from starlette.concurrency import run_in_threadpool
 
 from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
+from shmio.config.read import parse
 from shmio.endpoints.web.page import FollowedTab, Nothing, Page, call, release
-from shmio.errors import CommandError, ConfigError
+from shmio.errors import CommandError
 from shmio.injection.condition import Memory
 from shmio.injection.language import Number
 from shmio.injection.program import Decoder, compile_condition
@@ -203,14 +204,10 @@ def _parse(text: str) -> list[Declaration]:
     """Return the declarations in a campaign.
 
     Raises:
-        ConfigError: The text is not TOML, or a declaration is wrong.
+        ConfigError: The text is not TOML, is nested too deeply, or a declaration is wrong.
 
     """
-    try:
-        tables = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"the text is not valid TOML: {error}") from None
-    return parse_campaign(tables)
+    return parse_campaign(parse(Path("campaign"), text))
 
 
 def _described_declaration(declaration: Declaration) -> dict[str, Any]:

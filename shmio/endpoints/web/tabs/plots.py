@@ -56,6 +56,7 @@ class Plots(Tab):
     """Sends the values of registers over time. A page that stalls gets a gap, and then the newest data."""
 
     name: ClassVar[str] = "plots"
+    takes_turns: ClassVar[bool] = False
 
     def __init__(self, page: Page) -> None:
         super().__init__(page)

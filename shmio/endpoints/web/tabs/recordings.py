@@ -96,6 +96,7 @@ class RecordingsTab(Tab):
     """Shows recordings, and controls replays."""
 
     name: ClassVar[str] = "recordings"
+    takes_turns: ClassVar[bool] = False
 
     def __init__(self, page: Page) -> None:
         super().__init__(page)

@@ -270,6 +270,46 @@ def test_role_is_needed(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> No
         assert "needs the role control" in said(browser, "overview.follow")["error"]
 
 
+def test_client_with_many_calls_under_way_delays_only_itself(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait(*_: object) -> None:
+        await asyncio.Event().wait()
+
+    called = {
+        name: page.Call(role, page.Nothing, wait)
+        for name, role in (("overview.wait", "read"), ("overview.do", "write"))
+    }
+    monkeypatch.setattr(TABS[0], "calls", {**TABS[0].calls, **called})
+    tokens = (*SECRETS, Secret("bob", frozenset({"read"}), digest(b"bobs")))
+    with pages(segment, tokens, roles=()) as server, ExitStack() as stack:
+        for _ in range(3):
+            busy = stack.enter_context(server.open(server.sign_in(TOKEN)))
+            for number in range(page.MAX_CALLS):
+                busy.send(json.dumps({"id": number, "call": "overview.wait"}))
+        with server.open(server.sign_in("bobs")) as other:
+            assert said(other, "registers.rows", first=0, count=0)["result"]["rows"] == []
+        with server.open(server.sign_in(TOKEN)) as same:  # calls with other roles, and of tabs with limits of their own
+            assert "needs the role write" in said(same, "overview.do")["error"]
+            assert said(same, "recordings.files")["result"]["files"] == []
+
+
+def test_client_with_most_pages_makes_room_for_others(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(app, "MAX_PAGES", 3)
+    tokens = (*SECRETS, Secret("bob", frozenset({"read"}), digest(b"bobs")))
+    with pages(segment, tokens, roles=()) as server, ExitStack() as stack:
+        cookie = server.sign_in(TOKEN)
+        many = [stack.enter_context(server.open(cookie)) for _ in range(3)]
+        for one in many:
+            assert said(one, "overview.follow")["result"] is None
+        with server.open(server.sign_in("bobs")) as other:
+            assert said(other, "overview.follow")["result"] is None
+            with pytest.raises(ConnectionClosed, match="another client needs one"):
+                said(many[0], "overview.leave")
+            with server.open(cookie) as further, pytest.raises(ConnectionClosed, match="3 pages are open"):
+                said(further, "overview.follow")
+            assert said(many[1], "overview.follow")["result"] is None
+            assert said(other, "overview.follow")["result"] is None
+
+
 BY_GRPC = {
     "registers.set": "Write",
     "registers.override": "Inject",

@@ -163,15 +163,51 @@ def test_an_upload_waits_for_others_to_be_compiled_but_not_for_ever(monkeypatch:
             return b"done"
 
         monkeypatch.setattr(uploads, "compile_uploads", long)
-        first = [asyncio.create_task(some.compile(b"")) for _ in range(uploads.MAX_COMPILING)]
+        first = [asyncio.create_task(some.compile(b"", str(number))) for number in range(uploads.MAX_COMPILING)]
         await asyncio.sleep(0)
         with monkeypatch.context() as impatient:
             impatient.setattr(uploads, "WAIT_S", 0)
             with pytest.raises(EndpointError, match="try again"):
-                await some.compile(b"")
-        waiting = asyncio.create_task(some.compile(b""))
+                await some.compile(b"", "another")
+        waiting = asyncio.create_task(some.compile(b"", "another"))
         done.set()
         assert await asyncio.gather(*first, waiting) == [b"done"] * (uploads.MAX_COMPILING + 1)
+
+    asyncio.run(run())
+
+
+def test_deep_files_are_refused_with_a_reason() -> None:
+    """100,000 levels in each format: no parser may follow them."""
+    levels = 100_000
+    for name, text, reason in (
+        ("x.db", f"DATA_BLOCK x STRUCT {'a : STRUCT ' * levels}", "structures are nested more than 32 deep"),
+        ("x.toml", f"a = {'[' * levels}1{']' * levels}", "nested too deeply"),
+        ("x.toml", f"a = {'{a=' * levels}1{'}' * levels}", "nested too deeply"),
+        ("x.toml", f"{'a.' * levels}a = 1", "a key has more than 64 parts"),
+        ("x.toml", f"[{'a.' * levels}a]", "a key has more than 64 parts"),
+        ("x.xml", f"<Document>{'<a>' * levels}{'</a>' * levels}</Document>", "XML"),
+        ("x", "[" * levels, "expected DATA_BLOCK"),
+    ):
+        found = describe(f'[{{"name": "{name}", "size": {len(text)}}}]\n{text}'.encode())
+        assert reason in "\n".join(found["messages"]), name
+    assert "malformed" in describe(b"[" * levels)["messages"][0]
+
+
+def test_uploads_of_one_client_leave_room_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        some, done = uploads.Uploads(), asyncio.Event()
+
+        async def compiled(body: bytes) -> bytes:
+            if body == b"long":
+                await done.wait()
+            return body
+
+        monkeypatch.setattr(uploads, "compile_uploads", compiled)
+        busy = [asyncio.create_task(some.compile(b"long", "a")) for _ in range(5)]
+        await asyncio.sleep(0)
+        assert await some.compile(b"short", "b") == b"short"
+        done.set()
+        await asyncio.gather(*busy)
 
     asyncio.run(run())
 

@@ -45,11 +45,13 @@ def test_check_says_what_a_campaign_would_inject(segment: Segment) -> None:
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("[[injection]", "the text is not valid TOML"),
+        ("[[injection]", "campaign: the file is not valid TOML"),
         ("", "injection: this key is needed"),
         (CAMPAIGN.replace("position", "nothing"), "injection[0].target"),
         (CAMPAIGN.replace("> 3", ">"), "injection[0].when"),
-        ("x = " + "[" * 5000, "the text is not valid TOML"),
+        ("x = " + "[" * 5000, "nested more than 64 deep"),
+        ("a." * 29_000 + "a = 1", "campaign:1: a key is longer than"),
+        ("x = " + "1" * 5000, "too many digits"),
         ("#" * 61_000, "malformed"),
     ],
 )
