@@ -87,6 +87,16 @@ def test_a_next_request_has_the_same_deadline(segment: Segment, monkeypatch: pyt
         assert endpoint.server.counters.refused == 1
 
 
+def test_answers_are_sent_at_once(segment: Segment) -> None:
+    """Otherwise, the kernel holds the second part of an answer back until the first is acknowledged, up to 40 ms."""
+    with served(segment) as endpoint, connected(endpoint) as client:
+        client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert client.recv(4096)
+        [connection] = endpoint.server._server.server_state.connections
+        accepted = connection.transport.get_extra_info("socket")
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
 def test_oldest_of_too_many_connections_is_closed(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 3)
     with served(segment) as endpoint, ExitStack() as stack:
