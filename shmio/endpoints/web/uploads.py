@@ -192,24 +192,26 @@ def _compile(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
     """
     suffix = files[0].file.lower()
     is_list = not suffix.endswith(SOURCES) and (len(files) == 1 or suffix.endswith(".xml"))
-    if is_list and not suffix.endswith(SUFFIXES) and (found := _import(files)) is not None:
-        return found
+    if is_list and not suffix.endswith(SUFFIXES):
+        try:
+            return _import(files)
+        except ImportingError as error:
+            if suffix.endswith(".xml"):  # it is no source, so only the import says what is wrong with it
+                raise LayoutError(f"{files[0].file}: {error}") from None
     try:
         compiled = compile_sources(files)
     except LayoutError:
-        if is_list and (found := _import(files)) is not None:
-            return found
+        if is_list:
+            with suppress(ImportingError):
+                return _import(files)
         raise
     return compiled.layouts, [str(warning) for warning in compiled.warnings]
 
 
-def _import(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]] | None:
-    """Import a tag list of another tool, with the files of its types; return None if it is not such a list."""
+def _import(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
+    """Import a tag list of another tool, with the files of its types; raise ImportingError if it is not such a list."""
     file, *further = files
-    try:
-        found: Found = import_tags(file.text, file.file, further=further)
-    except ImportingError:
-        return None
+    found: Found = import_tags(file.text, file.file, further=further)
     layouts = [place_tags(PurePath(file.file).stem or "tags", found.tags)] if found.tags else []
     return layouts, list(found.report())
 
