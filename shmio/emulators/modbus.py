@@ -290,7 +290,9 @@ class ModbusEmulator:
         def connect() -> Any:
             handler = connected()
             if len(server.active_connections) >= MAX_CLIENTS:
-                server.loop.call_soon(server.loop.call_soon, handler.close)  # once the handler has its connection
+                silent = (one for one in server.active_connections.values() if one.last_pdu is None)
+                # The oldest client that never sent a request makes room; else close the new one once it is connected.
+                server.loop.call_soon(server.loop.call_soon, next(silent, handler).close)
             return handler
 
         server.callback_new_connection = connect

@@ -584,6 +584,8 @@ class S7Server(Server):
         self._memory = Memory(self.memory_areas)
         self.lock = self._memory.lock
         self._client_sockets: set[socket.socket] = set()
+        self._beginners: dict[socket.socket, threading.Thread] = {}
+        """The clients that have not set up communication yet, the oldest first."""
         self._stopping = threading.Event()
         self._checksums: dict[int, int] = {}
         self._accepted = 0  # number of clients so far
@@ -726,8 +728,9 @@ class S7Server(Server):
                 client.close()
 
     def _admit(self, client: socket.socket) -> None:
-        """Start a thread for the client, if there is room."""
+        """Start a thread for the client, if there is room: clients that never set up communication make room."""
         address = client.getpeername()
+        self._make_room()
         with self.client_lock:
             if self.client_count >= self.max_clients:
                 raise RuntimeError(f"{address[0]}: there are {self.max_clients} clients already")
@@ -737,7 +740,18 @@ class S7Server(Server):
             thread.start()
             self.clients.append(thread)
             self._client_sockets.add(client)
+            self._beginners[client] = thread
             self.client_count += 1
+
+    def _make_room(self) -> None:
+        """If there is no room, disconnect the oldest client that has not set up communication."""
+        with self.client_lock:
+            if self.client_count < self.max_clients or not self._beginners:
+                return
+            oldest, thread = next(iter(self._beginners.items()))
+            with contextlib.suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)
+        thread.join(_JOIN_TIMEOUT_S)
 
     def _handle_client(self, client_socket: socket.socket, address: tuple[str, int]) -> None:
         try:
@@ -747,6 +761,7 @@ class S7Server(Server):
             with self.client_lock:  # waits until _admit has registered the client
                 self.clients.remove(threading.current_thread())
                 self._client_sockets.discard(client_socket)
+                self._beginners.pop(client_socket, None)
                 self.client_count -= 1
                 client_socket.close()
 
@@ -763,7 +778,7 @@ class S7Server(Server):
         delays = None if self._options.profile is None else Delays(self._options.profile, seed)
         outbox = _Outbox(client, delays, self._stopping)
         with contextlib.suppress(ViolationError):
-            self._answer(inbox, outbox, address, self._connect(client, inbox, outbox))
+            self._answer(client, inbox, outbox, address, self._connect(client, inbox, outbox))
 
     @staticmethod
     def _connect(client: socket.socket, inbox: Inbox, outbox: _Outbox) -> int:
@@ -779,7 +794,9 @@ class S7Server(Server):
         outbox.put("confirm", confirm)
         return longest
 
-    def _answer(self, inbox: Inbox, outbox: _Outbox, address: tuple[str, int], longest: int) -> None:
+    def _answer(
+        self, client: socket.socket, inbox: Inbox, outbox: _Outbox, address: tuple[str, int], longest: int
+    ) -> None:
         jobs, parts = Jobs(self._memory, self._options, longest), _Parts()
         while True:
             while (pdu := inbox.pdu()) is not None:
@@ -790,6 +807,9 @@ class S7Server(Server):
                     answer = self._process_in_parts(bytes(pdu), address, jobs, parts)
                 if answer:
                     outbox.put(_kind_of(pdu), _TPKT.pack(3, len(answer) + _FRAME_OVERHEAD) + _DT + answer)
+            if jobs.pdu_size and client in self._beginners:
+                with self.client_lock:
+                    self._beginners.pop(client, None)
             outbox.send()
             if outbox.wait() and not inbox.receive():
                 break

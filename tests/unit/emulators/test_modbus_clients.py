@@ -135,3 +135,14 @@ def test_all_sources_of_a_device_have_one_framing() -> None:
         pytest.raises(ConfigError, match="restart the instance to change the framing"),
     ):
         emulator.change(served[1:])
+
+
+def test_clients_that_never_send_a_request_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.emulators.modbus.MAX_CLIENTS", 2)
+    with emulated("tcp") as (address, _), closing(Client(address, "tcp")) as working:
+        assert working.ask("03 0000 0001") == "03 02 00 00"
+        silent = socket.create_connection((address.host, address.port), 20)
+        with silent, closing(Client(address, "tcp")) as other:
+            assert other.ask("03 0000 0001") == "03 02 00 00"
+            assert silent.recv(1) == b""
+        assert working.ask("03 0000 0001") == "03 02 00 00"

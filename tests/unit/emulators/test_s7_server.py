@@ -221,6 +221,23 @@ def test_number_of_clients_is_limited(server: S7Server, block: bytearray) -> Non
         assert [client.read() for client in clients[:4]] == [block] * 4
 
 
+def test_clients_that_never_set_up_communication_make_room(server: S7Server, block: bytearray) -> None:
+    with ExitStack() as stack:
+        working = stack.enter_context(closing(ours(server)))
+        working.connect()
+        silent = [stack.enter_context(socket.create_connection(tuple_of(server))) for _ in range(3)]
+        for peer in silent:
+            peer.settimeout(10)
+            peer.sendall(SESSION)
+            assert peer.recv(100)[5] == 0xD0  # connected, as a real CPU confirms it
+        other = stack.enter_context(closing(ours(server)))
+        other.connect()
+        assert silent[0].recv(1) == b""  # the oldest
+        assert working.read() == other.read() == block
+        silent[2].sendall(SETUP)
+        assert silent[2].recv(100)
+
+
 def test_stop_ends_clients_in_every_state(server: S7Server) -> None:
     with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as silent:
         client.connect()
@@ -236,6 +253,7 @@ def tuple_of(server: S7Server) -> tuple[str, int]:
 
 
 SESSION = bytes.fromhex("0300001611e00000000100c1020100c2020101c0010a")
+SETUP = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
 
 
 @pytest.mark.parametrize(
@@ -277,7 +295,6 @@ JOBS = [
 
 
 def test_noise_in_control_and_status_jobs_ends_at_most_its_own_connection(server: S7Server, block: bytearray) -> None:
-    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
     noise = random.Random(4)
     before = bytes(block)
     with closing(ours(server)) as client:
@@ -294,7 +311,7 @@ def test_noise_in_control_and_status_jobs_ends_at_most_its_own_connection(server
                 peer.settimeout(10)
                 received = b""
                 with contextlib.suppress(ConnectionError):
-                    peer.sendall(SESSION + setup + b"".join(pdus))
+                    peer.sendall(SESSION + SETUP + b"".join(pdus))
                     peer.shutdown(socket.SHUT_WR)
                     while data := peer.recv(4096):
                         received += data
@@ -309,12 +326,11 @@ def send_forever(peer: socket.socket, data: bytes) -> None:
 
 def test_client_that_reads_no_answers_delays_no_other(server: S7Server, block: bytearray) -> None:
     request = bytes.fromhex("0300001f 02f080 32 01 0000 0001 000e 0000 04 01 12 0a 10 02 0384 0005 84 000000")
-    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
     with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as greedy:
         greedy.settimeout(10)
         greedy.sendall(SESSION)
         greedy.recv(100)
-        greedy.sendall(setup)
+        greedy.sendall(SETUP)
         greedy.recv(100)
         greedy.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -324,7 +340,6 @@ def test_client_that_reads_no_answers_delays_no_other(server: S7Server, block: b
 
 
 def test_requests_byte_by_byte_and_many_at_once(server: S7Server, block: bytearray) -> None:
-    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
     request = bytes.fromhex("0300001f 02f080 32 01 0000 0002 000e 0000 04 01 12 0a 10 02 0004 0005 84 000000")
     answer = bytes.fromhex("0300001d 02f080 32 03 0000 0002 0002 0008 0000 04 01 ff 04 0020") + block[:4]
     with socket.create_connection(tuple_of(server)) as peer, peer.makefile("rb") as stream:
@@ -332,7 +347,7 @@ def test_requests_byte_by_byte_and_many_at_once(server: S7Server, block: bytearr
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.sendall(SESSION)
         stream.read(22)
-        peer.sendall(setup)
+        peer.sendall(SETUP)
         stream.read(27)
         for byte in request:
             peer.sendall(bytes((byte,)))
