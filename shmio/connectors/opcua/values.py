@@ -31,6 +31,8 @@ _TEXTS: Final = frozenset({
 })  # fmt: skip
 _OF_BYTES: Final = {"DATE_AND_TIME": 8, "POINTER": 6, "ANY": 10}
 """Types that some servers represent as arrays of bytes, with their sizes."""
+_AS_NUMBERS: Final = {"S5TIME": ua.UINT16, "CHAR": ua.BYTE, "WCHAR": ua.UINT16}
+"""Types whose own format some servers represent as a number, with the type of the number."""
 _CHARACTERS: Final = frozenset({"BYTE", "USINT", "CHAR"})
 _DTL: Final = struct.Struct("<HBBBBBBI")
 _DTL_THERE: Final = struct.Struct(">HBBBBBBI")
@@ -108,6 +110,8 @@ class ValueConverter:
     def _converter(self, kind: int) -> Callable[[Any], Scalar] | None:
         """Return the function that converts an element of node type ``kind``; None if the type does not fit."""
         base, scale = self._base, self._register.scale
+        if kind == _AS_NUMBERS.get(base):
+            return lambda number: self._decoded(number.to_bytes(self._register.element.size, "big"))
         if base == "BOOL":
             return bool if kind == ua.BOOLEAN else None
         if base in INTEGERS or base in ("REAL", "LREAL"):
@@ -121,17 +125,11 @@ class ValueConverter:
                 lambda number: float(number * factor + offset)
             )  # fmt: skip
         if base in ("TIME", "LTIME", "TIME_OF_DAY", "LTOD", "S5TIME"):
-            if base == "S5TIME" and kind == ua.UINT16:  # the controller's own format
-                return lambda word: self._decoded(word.to_bytes(2, "big"))
             if kind in _INTEGERS:
                 return _same
             return _rounded if kind in _FLOATS and base == "TIME" else None
         if base in ("STRING", "WSTRING"):
             return str if kind in _TEXTS else None
-        if base in ("CHAR", "WCHAR"):
-            if kind == ua.STRING:
-                return str
-            return chr if kind == (ua.BYTE if base == "CHAR" else ua.UINT16) else None
         if kind == ua.STRING:
             return str
         if kind == ua.DATE_TIME and base in ("DATE", "DATE_AND_TIME", "LDT", "DTL"):
@@ -202,10 +200,8 @@ class ValueConverter:
         base, scale = self._base, self._register.scale
         if kind == ua.BOOLEAN and base == "BOOL":
             return bool(value)
-        if base == "S5TIME" and kind == ua.UINT16:
+        if kind == _AS_NUMBERS.get(base):
             return int.from_bytes(self._encoded(value), "big")
-        if (base == "CHAR" and kind == ua.BYTE) or (base == "WCHAR" and kind == ua.UINT16):
-            return ord(value)
         if base == "DATE" and kind == ua.UINT16:
             return (calendar.parse_moment(value) or 0) // calendar.NS_PER_DAY - calendar.DATE_EPOCH_DAYS
         if base == "DTL" and kind == ua.EXTENSION and like is not None:

@@ -12,6 +12,7 @@ from shmio.connectors.opcua.decode import NAMES, Extension, Sample
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage
 from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
 
 TYPES = (
     "BOOL", "BYTE", "USINT", "SINT", "WORD", "UINT", "INT", "DWORD", "UDINT", "DINT", "LWORD", "ULINT", "LINT", "REAL",
@@ -46,3 +47,18 @@ def test_a_value_fits_or_is_refused(element: str) -> None:
                     with suppress(MismatchError, ValueError, OverflowError):
                         image.put(0, converter.value(Sample(number, found, dims, 0, 0)))
                     assert len(bytes(image)) == layout.size
+
+
+def test_a_character_that_a_server_sends_as_a_number_has_the_encoding_of_its_register() -> None:
+    # S7-1500: CHAR is a Byte, WCHAR a UInt16 (function manual "Communication"). WHATWG, index-windows-1252: 80 is €.
+    for kind, element, found, value in (
+        (3, "CHAR", 0x80, "€"), (3, "CHAR", 0x81, "\x81"), (3, "CHAR", 0x41, "A"), (5, "WCHAR", 0x20AC, "€"),
+        (5, "WCHAR", 0xD83D, "\U0010f83d"),
+    ):  # fmt: skip
+        layout = place_tags("device", {"it": {"type": element, "address": "i=1"}})
+        layout = layout.with_encoding("windows-1252").with_statuses()
+        image, converter = RegisterImage(layout), ValueConverter(layout.registers[0])
+        sample = Sample(kind, found, None, 0, 0)
+        assert image.put(0, converter.value(sample)) == ""
+        assert codec(layout.registers[0], layout.byte_order).decode(bytes(image)) == value
+        assert converter.sample(value, sample) == sample
