@@ -79,7 +79,13 @@ listen = "{mqtt}"
 [opcua]
 listen = "{opcua}"
 anonymous = ["read"]
+
+[fabric]
+server = "embedded"
+listen = "{fabric}"
+cell = "plant1.line3.a50"
 """
+FABRIC_CELL: Final = "plant1.line3.a50"
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,7 @@ class Place:
     grpc: str
     mqtt: str
     opcua: str
+    fabric: str
     control: str
     instance: str
 
@@ -424,6 +431,104 @@ def other_opcua(place: Place) -> Iterator[Callable[[], object]]:
         yield node.read_value
 
 
+# -- the fabric ----------------------------------------------------------------------------------------------------
+
+
+MISSING: Final = f"shmio.{FABRIC_CELL}.cell.missing"
+
+
+async def plain_nats(place: Place, **options: Any) -> Any:
+    """Connect as a program without credentials, which may read."""
+    import nats
+
+    async def ignore(_: Exception) -> None:
+        """The server reports what a slow client has lost."""
+
+    return await nats.connect(f"nats://{place.fabric}", error_cb=ignore, **options)
+
+
+def load_fabric(place: Place) -> None:
+    """Receive all frames many times, and ask the uplink for all that it keeps, and the server for the registry."""
+
+    async def load() -> None:
+        one = await plain_nats(place)
+        entry = {"last_by_subj": f"$KV.shmio_cells.{FABRIC_CELL}"}
+        request = json.dumps({"stream": await stream_of(one), "first": 1, "last": 1 << 62}).encode()
+
+        async def take(_: object) -> None:
+            """Take a message."""
+
+        for _ in range(4):
+            await one.subscribe(f"shmio.{FABRIC_CELL}.*.live", cb=take)
+        inbox = one.new_inbox()
+        await one.subscribe(inbox, cb=take, pending_bytes_limit=1 << 40, pending_msgs_limit=1 << 30)
+        while True:
+            for _ in range(8):
+                await one.publish(MISSING, request, reply=inbox)
+                await one.publish("$JS.API.STREAM.MSG.GET.KV_shmio_cells", json.dumps(entry).encode(), reply=inbox)
+                await one.publish("$JS.API.STREAM.INFO.KV_shmio_layouts", b'{"subjects_filter":">"}', reply=inbox)
+            await one.flush()
+
+    async def again() -> None:
+        while True:
+            with suppress(Exception):  # a limit ends the connection
+                await load()
+
+    async def work() -> None:
+        await asyncio.gather(*(again() for _ in range(16)))
+
+    asyncio.run(work())
+
+
+async def stream_of(one: Any) -> int:
+    """Return the number of the stream that the uplink publishes."""
+    next_one = asyncio.get_running_loop().create_future()
+
+    async def take(message: Any) -> None:
+        if not next_one.done():
+            next_one.set_result(int.from_bytes(message.data[8:16], "little"))
+
+    watching = await one.subscribe(f"shmio.{FABRIC_CELL}.cell.live", cb=take)
+    found: int = await next_one
+    await watching.unsubscribe()
+    return found
+
+
+@contextmanager
+def other_fabric(place: Place) -> Iterator[Callable[[], object]]:
+    """Ask for the newest message, as a mirror does that has missed it, and receive each number beside it."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    lost: list[int] = []
+    last = [0]
+
+    def of(work: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(work, loop).result(CALL_S)
+
+    async def follow(message: Any) -> None:
+        number = int.from_bytes(message.data[16:24], "little")
+        if last[0] and number != last[0] + 1:
+            lost.append(number)
+        last[0] = number
+
+    one = of(plain_nats(place, allow_reconnect=False))
+    stream = of(stream_of(one))
+    of(one.subscribe(f"shmio.{FABRIC_CELL}.cell.live", cb=follow))
+
+    def ask() -> None:
+        request = json.dumps({"stream": stream, "first": last[0], "last": last[0]}).encode()
+        of(one.request(MISSING, request, timeout=CALL_S))
+        if lost:
+            raise LostError(f"messages before {lost}")
+
+    yield ask
+    of(one.close())
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join()
+    loop.close()
+
+
 # -- the supervisor's control socket -------------------------------------------------------------------------------
 
 
@@ -444,6 +549,7 @@ ENDPOINTS: Final[Mapping[str, Endpoint]] = {
     "shmio.v1": Endpoint("grpc", load_shmio_v1, other_shmio_v1),
     "mqtt": Endpoint("mqtt", load_mqtt, other_mqtt),
     "opcua": Endpoint("opcua", load_opcua, other_opcua),
+    "fabric": Endpoint("fabric", load_fabric, other_fabric),
     "control": Endpoint("cell", load_control, other_control),
 }
 
@@ -452,7 +558,7 @@ ENDPOINTS: Final[Mapping[str, Endpoint]] = {
 def started(folder: Path, instance: str) -> Iterator[tuple[Cell, Place]]:
     """Run a cell with all endpoints."""
     with ExitStack() as stack:
-        names = ("web", "metrics", "mqtt", "opcua")
+        names = ("web", "metrics", "mqtt", "opcua", "fabric")
         plc, remote, *others = (stack.enter_context(reserved_port()) for _ in range(2 + len(names)))
         shutil.copy(ROOT / "db201.db", folder)
         addresses = {name: str(address) for name, address in zip(names, others, strict=True)}

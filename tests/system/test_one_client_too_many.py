@@ -8,7 +8,7 @@ import pytest
 
 from tests.faults.one_client_too_many import ENDPOINTS, run, started
 
-for library in ("uvicorn", "asyncua"):
+for library in ("uvicorn", "asyncua", "nats"):
     pytest.importorskip(library)
 
 
