@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import heapq
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
@@ -46,6 +47,38 @@ class _Sent(NamedTuple):
     size: int
 
 
+class _Turns:
+    """Gives turns to answers: the next one is of the answer that has had the fewest, and of these the first to ask."""
+
+    def __init__(self) -> None:
+        self._taken = False
+        self._asked = 0
+        self._waiting: list[tuple[int, int, asyncio.Event]] = []
+
+    @asynccontextmanager
+    async def turn(self, had: int) -> AsyncIterator[None]:
+        """Wait for a turn; ``had`` is the number of turns that the answer has had."""
+        self._asked += 1
+        place = had, self._asked, asyncio.Event()
+        heapq.heappush(self._waiting, place)
+        if not self._taken:
+            self._next()
+        try:
+            await place[2].wait()
+            yield
+        finally:
+            if place in self._waiting:  # cancelled before its turn
+                self._waiting.remove(place)
+                heapq.heapify(self._waiting)
+            else:
+                self._next()
+
+    def _next(self) -> None:
+        self._taken = bool(self._waiting)
+        if self._taken:
+            heapq.heappop(self._waiting)[2].set()
+
+
 class Publisher:
     """Sends the messages of a backlog. Use it only in the event loop's thread."""
 
@@ -70,7 +103,7 @@ class Publisher:
         self._unconfirmed: deque[_Sent] = deque()
         self._unconfirmed_bytes = 0
         self._tasks: list[asyncio.Task[None]] = []
-        self._turns = asyncio.Lock()  # the longest waiting one is the next
+        self._turns = _Turns()
         self._errors = library("nats.errors", INSTALL)
 
     @property
@@ -226,10 +259,12 @@ class Publisher:
         known = row is not None and row.stream == wanted.stream
         numbers = iter(row.between(wanted.first, wanted.last) if row is not None and known else ())
         with suppress(self._errors.Error, TimeoutError):
+            turns = 0
             more = row is not None
             while more and row is not None:
-                async with self._turns:
+                async with self._turns.turn(turns):
                     more = await self._send_some(client, message.reply, row, numbers)
+                turns += 1
             await client.publish(message.reply, b"")
 
     async def _send_some(self, client: FabricClient, reply: str, row: Row, numbers: Iterator[int]) -> bool:
