@@ -28,9 +28,8 @@ from shmio.wording import brief
 _MAX_NS: Final = (1 << 63) - 1
 _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
 """Pairs (limit, unit in ns): a time below the limit is in this unit (s, ms or µs). A larger time is in ns."""
-_EPOCH: Final = re.compile(r"[0-9]{1,20}(?:\.[0-9]{1,20})?")
-_DATE_DIGITS: Final = 8
-"""Number of digits of a date such as 20240229, which is no time since 1970."""
+_EPOCH: Final = re.compile(r"(?!(?:[0-9]{8}|[0-9]{12})\Z)[0-9]{1,20}(?:\.[0-9]{1,20})?")
+"""A time since 1970, unlike dates such as 20240229 and 202402291200."""
 
 log = logging.getLogger("shmio.source.mqtt")
 
@@ -122,7 +121,7 @@ class Topic(Origin):
         self._time, self._quality, self._max_bytes = time, quality, max_bytes
         self._document: Document | ValueFaultError | None = None
         self._decoded: Message | None = None
-        self._choosing: list[int] = []
+        self._choosing: dict[int, Choice] = {}
         """The registers whose path selects an object by a member. Not every message contains this object."""
         self._chosen: dict[int, tuple[Found | ValueFaultError, int]] = {}
         """What the last message with the object of such a register contains for it, and the message's ``order``."""
@@ -132,8 +131,8 @@ class Topic(Origin):
     def place(self, index: int, steps: Steps | None) -> None:
         """Give a register its place in the messages."""
         self.places[index] = steps
-        if any(isinstance(step, Choice) for step in steps or ()):
-            self._choosing.append(index)
+        if (choice := next((step for step in steps or () if isinstance(step, Choice)), None)) is not None:
+            self._choosing[index] = choice
 
     @property
     def fault(self) -> int:
@@ -172,8 +171,9 @@ class Topic(Origin):
             return self._found(index, message)
         found, _ = self._chosen.get(index, (None, 0))
         if found is None:
-            choice = next(step for step in self.places[index] or () if isinstance(step, Choice))
-            raise ValueFaultError(BAD_WAITING_FOR_INITIAL_DATA, f"no message has contained an object {choice} yet")
+            raise ValueFaultError(
+                BAD_WAITING_FOR_INITIAL_DATA, f"no message has contained an object {self._choosing[index]} yet"
+            )
         if isinstance(found, ValueFaultError):
             raise found
         return found
@@ -252,7 +252,7 @@ def time_ns(found: Any) -> int:
 
     A time is a number of s, ms, µs or ns, also as text, or text in ISO 8601.
     """
-    if isinstance(found, str) and len(found) != _DATE_DIGITS and _EPOCH.fullmatch(found):
+    if isinstance(found, str) and _EPOCH.fullmatch(found):
         found = float(found) if "." in found else int(found)
     if isinstance(found, str):
         try:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 
 from shmio.errors import ValueRangeError
+from shmio.layout.encodings import text_encoding
 from shmio.layout.model import INTEGERS, ByteOrder, ElementType, Register
 from shmio.layout.values import calendar
 from shmio.layout.values.codec import Scalar, Value, nest, scalar_codec
@@ -31,7 +32,8 @@ _BYTES = re.compile(r"B#\s*\((.*)\)", re.IGNORECASE)
 _BYTES_BITS = {"WORD": 16, "DWORD": 32}
 _COUNT = re.compile(r"C#([0-9]{1,3})", re.IGNORECASE)
 _NUMBERED = re.compile(r"(?:T|C|Z|FB|FC|DB|SDB)\s*([0-9]{1,5})", re.IGNORECASE)
-_ESCAPE = re.compile(r"\$(?:([LlNnPpRrTt$'])|([0-9A-Fa-f]{4})|([0-9A-Fa-f]{2}))")
+_ESCAPE = re.compile(r"\$([LlNnPpRrTt$'])|((?:\$[0-9A-Fa-f]{2})+)")  # bytes in the register's encoding
+_WIDE_ESCAPE = re.compile(r"\$([LlNnPpRrTt$'])|((?:\$[0-9A-Fa-f]{4})+)|\$([0-9A-Fa-f]{2})")  # units of UTF-16
 _ESCAPED = {"L": "\n", "N": "\r\n", "P": "\f", "R": "\r", "T": "\t", "$": "$", "'": "'"}
 
 _NS = {
@@ -237,10 +239,11 @@ def _text(text: str, element: ElementType) -> str | None:
         if match[1]:
             return _ESCAPED[match[1].upper()]
         if match[2]:
-            return chr(int(match[2], 16)) if wide else chr(int(match[2][:2], 16)) + match[2][2:]
+            encoding = text_encoding("utf-16-be" if wide else element.encoding)
+            return encoding.decode(bytes.fromhex(match[2].replace("$", "")))
         return chr(int(match[3], 16))
 
-    return _ESCAPE.sub(unescape, text[1:-1])
+    return (_WIDE_ESCAPE if wide else _ESCAPE).sub(unescape, text[1:-1])
 
 
 # -- writing literals ----------------------------------------------------------------------------------------

@@ -116,7 +116,7 @@ def test_times(caplog: pytest.LogCaptureFixture) -> None:
     ):  # fmt: skip
         broker.publish("t", {"at": text, "x": 1})
         assert broker.status("x") == (GOOD, at_ns), text
-    wrongs: tuple[Any, ...] = ("02/29/2024 12:00:00", 0, "0", "", "20240229120000", [], None)
+    wrongs: tuple[Any, ...] = ("02/29/2024 12:00:00", 0, "0", "", "202402291200", "20240229120000", [], None)
     for wrong in wrongs:
         broker.publish("t", {"at": wrong, "x": 1})
         code, at_ns = broker.status("x")

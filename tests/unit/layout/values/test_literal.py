@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -72,12 +73,23 @@ def read(text: str, type_: str) -> Value:
         ("STRING#'a#b'", "STRING[5]", "a#b"),
         ("'$4142'", "STRING[5]", "A42"),
         ("WSTRING#'$20ACä'", "WSTRING[5]", "€ä"),
+        ("'a$80'", "STRING[5]", "a\x80"),
+        ("WSTRING#'$D83D$DE00'", "WSTRING[5]", "😀"),
         ("WCHAR#'轴'", "WCHAR", "轴"),
     ],
 )
 def test_literals(text: str, type_: str, value: Value) -> None:
     found = read(text, type_)
     assert (found, type(found)) == (value, type(value))
+
+
+def test_an_escaped_byte_is_in_the_encoding_of_the_register() -> None:
+    for encoding, text, value in (  # WHATWG, index-windows-1252 and index-gb18030
+        ("windows-1252", "'$80'", "€"), ("windows-1252", "'$81'", "\x81"), ("gbk", "'a$B5$E7$BB$FA'", "a电机"),
+    ):  # fmt: skip
+        element = element_type("STRING[5]")
+        assert element is not None
+        assert scalar_literal(text, msgspec.structs.replace(element, encoding=encoding)) == value
 
 
 @pytest.mark.parametrize(
