@@ -366,6 +366,20 @@ class ControlServer:
         self._selector.unregister(client)
         client.close()
 
+    def sweep(self) -> None:
+        """Remove what processes that were killed have left beside the socket: their sockets, and the broker's folder.
+
+        Leave all to a successor that has created its own socket.
+        """
+        own = Path(self._path)
+        with suppress(OSError):
+            if os.lstat(own).st_ino != self._inode:
+                return
+            broker = own.with_name(f"{own.stem}.mq")
+            for path in (*own.parent.glob(f"{own.stem}+*{own.suffix}"), *broker.glob("*")):
+                path.unlink(missing_ok=True)
+            broker.rmdir()
+
     def retire(self) -> None:
         """Remove the socket, so that a new supervisor can create its own.
 

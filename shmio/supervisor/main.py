@@ -139,6 +139,7 @@ class Supervisor:
             self._loop()
             for job in self._reloader.plan.jobs:
                 job.remove_sockets()
+            self._control.sweep()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
             self._segment.unlink()  # before answering: the client may start it again at once
