@@ -115,7 +115,7 @@ class Found:
 
     def skip(self, name: str, why: str, line: int = 0) -> None:
         """Record that the item ``name`` in a line of the file is left out, with the reason ``why``."""
-        self._skipped.setdefault(why, []).append((name, line))
+        self._skipped.setdefault(shorten(why, MAX_TEXT), []).append((name, line))
 
     @property
     def skipped(self) -> Mapping[str, list[tuple[str, int]]]:

@@ -7,6 +7,7 @@ from typing import Final
 from shmio.layout.importing.found import Found, of_s7
 from shmio.layout.s7.notation import value_type
 
+NO_ADDRESS: Final = "the tag has no address"
 CONSTANT: Final = "a constant has no value in the controller"
 
 
@@ -17,7 +18,7 @@ def add_plc_tag(
     if not name:
         found.skip("a row", "the row has no name", line)
     elif not address:
-        found.skip(name, "the tag has no address", line)
+        found.skip(name, NO_ADDRESS, line)
     elif kind.startswith('"'):
         found.skip(name, "a PLC data type; name its members in the table", line)
     else:

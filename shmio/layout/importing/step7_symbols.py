@@ -12,7 +12,7 @@ from typing import Final
 
 from shmio.layout.foreign import COLUMNS, FIXED, MAX_PROBED, OPERAND, headings, is_header
 from shmio.layout.importing.found import Found, ImportingError
-from shmio.layout.importing.plc_tag import CONSTANT, add_plc_tag
+from shmio.layout.importing.plc_tag import CONSTANT, NO_ADDRESS, add_plc_tag
 from shmio.layout.rows import delimiter_of, rows
 from shmio.layout.s7.notation import from_classic
 
@@ -35,6 +35,8 @@ def read(text: str) -> Found:
             found.skip("a row", "the row has no symbol", line)
         elif address.upper() == "CONSTANT":
             found.skip(name, CONSTANT, line)
+        elif not address:
+            found.skip(name, NO_ADDRESS, line)
         elif place is None:
             found.skip(name, _NOT_A_VALUE if OPERAND.fullmatch(address) else f"{address!r} is not an address", line)
         else:

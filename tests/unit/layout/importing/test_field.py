@@ -578,3 +578,26 @@ def test_files_beside_sources_of_simatic_sd_are_named() -> None:
         compile_sources([Source("a.s7res", b"MultiLingualTexts:\n  - id: MLC_a\n    en-US: text\n")])
     header = b"(*\nV1 initial version\n*)\nDATA_BLOCK DB1 STRUCT a : Int; END_STRUCT BEGIN END_DATA_BLOCK"
     assert compile_sources([Source("a.awl", header)]).layouts[0].registers[0].path == "a"
+
+
+def test_the_remedies_of_a_skipped_tag_work() -> None:
+    """What is known about a system type gives its members their addresses; a size gives them to the members after it."""
+    ton = b'TYPE "TON_TIME"\nSTRUCT\nPT : Time;\nET : Time;\n"IN" : Bool;\nQ : Bool;\nEND_STRUCT;\nEND_TYPE\n'
+    data = (FIELD / "s7/ml_ton_member.xml").read_bytes()
+    declared = import_tags(data, further=[Source("ton.udt", ton)])
+    assert places(declared)["t/Q"] == ("BOOL", "%DB25.DBX8.1")
+    sized = import_tags(data, type_bytes={"TON_TIME": 10})
+    assert places(sized) == {"z": ("INT", "%DB25.DBW26")}
+    for found, members in ((declared, "i"), (sized, "ti")):
+        [(why, skipped)] = found.skipped.items()
+        assert [name for name, _ in skipped] == [f"{one}/{name}" for one in members for name in ("PT", "ET", "IN", "Q")]
+        assert "PLC data type" in why and "--by-name" in why
+    assert {*import_tags(data, by_name=True).tags} == {*declared.tags, "i/PT", "i/ET", "i/IN", "i/Q"}
+
+
+def test_reasons_are_short_and_name_what_is_missing() -> None:
+    found = import_tags(b'Name;Type;Address\na;Bool;%I0.0\nk;Int;\nlong;Int;' + b"M" * 100_000)
+    assert {name: len(why) <= 1000 for why, items in found.skipped.items() for name, _ in items} == {
+        "k": True, "long": True,
+    }  # fmt: skip
+    assert ("k", 3) in found.skipped["the tag has no address"]
