@@ -24,7 +24,7 @@ KEPSERVER: Final = "tag name"
 SHEET: Final = "PLC Tags"
 """The sheet with the tags in a workbook of TIA Portal."""
 _ROOT: Final = re.compile(r"(?>\s*<(?:\?[^>]*>|!--.*?-->))*+\s*<(?:[\w.-]+:)?([\w.-]+)", re.DOTALL)
-_IN_DOCUMENT: Final = re.compile(r"<SW\.(?:Blocks\.(?:GlobalDB|InstanceDB)|Tags\.PlcTagTable)\b")
+_IN_DOCUMENT: Final = re.compile(r"<SW\.(?:Blocks\.(?:GlobalDB|InstanceDB)|Tags\.PlcTag)\b")
 _MAX_LIST_OF_SHEETS: Final = 1 << 20
 _INSTEAD: Final = (
     "in TIA Portal, open the context menu of the data block, choose 'Generate source from blocks', and name the "
@@ -188,6 +188,8 @@ def misplaced_list(file: str, data: bytes) -> str:
 def _is_table(text: str, data: bytes) -> bool:
     """Return whether the text looks like a table of separated values and declares no block."""
     lines = [line for line in text.splitlines() if line.strip()][:3]
+    if lines and lines[0].startswith(FIXED):
+        return True
     if len(lines) < 2 or ":" in lines[0] or SOURCE.search(decode(data).text):
         return False
     counts = [len(_SEPARATORS.findall(line)) for line in lines]

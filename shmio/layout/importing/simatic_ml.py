@@ -159,9 +159,9 @@ def _add_block(
         if at is None and addresses:
             found.skip(
                 "/".join(names),
-                "its address is unknown, because it is in a system type, or after one of unknown size; declare the type as "
-                "a PLC data type in a further file, or leave out all addresses by --by-name to read the block by OPC UA; "
-                "for what is after it, its size by --type-bytes is enough",
+                "its address is unknown, because it is in a system type, or after one of unknown size; declare the "
+                "type as a PLC data type in a further file, or leave out all addresses by --by-name to read the block "
+                "by OPC UA; for what is after it, its size by --type-bytes is enough",
                 line,
             )
             continue

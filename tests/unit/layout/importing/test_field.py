@@ -14,6 +14,7 @@ from shmio.cli.layout import main
 from shmio.errors import LayoutError
 from shmio.layout.addresses import modbus, siemens
 from shmio.layout.compiler import Program, Source, compile_sources
+from shmio.layout.foreign import foreign
 from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.importing.importer import import_tags
 from shmio.layout.model import Layout
@@ -581,7 +582,6 @@ def test_files_beside_sources_of_simatic_sd_are_named() -> None:
 
 
 def test_the_remedies_of_a_skipped_tag_work() -> None:
-    """What is known about a system type gives its members their addresses; a size gives them to the members after it."""
     ton = b'TYPE "TON_TIME"\nSTRUCT\nPT : Time;\nET : Time;\n"IN" : Bool;\nQ : Bool;\nEND_STRUCT;\nEND_TYPE\n'
     data = (FIELD / "s7/ml_ton_member.xml").read_bytes()
     declared = import_tags(data, further=[Source("ton.udt", ton)])
@@ -591,13 +591,26 @@ def test_the_remedies_of_a_skipped_tag_work() -> None:
     for found, members in ((declared, "i"), (sized, "ti")):
         [(why, skipped)] = found.skipped.items()
         assert [name for name, _ in skipped] == [f"{one}/{name}" for one in members for name in ("PT", "ET", "IN", "Q")]
-        assert "PLC data type" in why and "--by-name" in why
+        assert "PLC data type" in why
+        assert "--by-name" in why
     assert {*import_tags(data, by_name=True).tags} == {*declared.tags, "i/PT", "i/ET", "i/IN", "i/Q"}
 
 
 def test_reasons_are_short_and_name_what_is_missing() -> None:
-    found = import_tags(b'Name;Type;Address\na;Bool;%I0.0\nk;Int;\nlong;Int;' + b"M" * 100_000)
+    found = import_tags(b"Name;Type;Address\na;Bool;%I0.0\nk;Int;\nlong;Int;" + b"M" * 100_000)
     assert {name: len(why) <= 1000 for why, items in found.skipped.items() for name, _ in items} == {
         "k": True, "long": True,
     }  # fmt: skip
     assert ("k", 3) in found.skipped["the tag has no address"]
+
+
+def test_no_message_recommends_the_import_of_a_file_that_has_only_constants() -> None:
+    data = (
+        b"<Document><SW.Tags.PlcTagTable><ObjectList><SW.Tags.PlcUserConstant><AttributeList><Name>N</Name>"
+        b"<Value>3</Value></AttributeList></SW.Tags.PlcUserConstant></ObjectList></SW.Tags.PlcTagTable></Document>"
+    )
+    assert not import_tags(data).tags
+    assert "this is XML" in foreign("c.xml", data)
+    assert "import" not in foreign("c.xml", data)
+    tags = data.replace(b"PlcUserConstant", b"PlcTag").replace(b"<Value>3", b"<DataTypeName>Int</DataTypeName><Value>3")
+    assert "shmio-layout import" in foreign("c.xml", tags)
