@@ -34,11 +34,7 @@ def workbook() -> bytes:
         ("cell.db", CSV.replace(",", ";").encode("utf-16"), "this is a table of tags"),
         ("cell.db", CSV.replace(",", "\t").encode("cp1252"), "this is a table of tags"),
         ("tags.sdf", b"x", "this is a table of tags"),
-        (
-            "tags.asc",
-            b"126,A                       I      0.0  BOOL      x\r\n",
-            "'shmio-layout import' makes a tag table",
-        ),
+        ("tags.asc", b"126,%-24s%-12s%-10s\r\n" % (b"A", b"I 0.0", b"BOOL"), "this is a table of tags"),
         ("cell.db", workbook(), "this is a spreadsheet"),
         ("cell.db", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(600), "this is a spreadsheet"),
         ("cell.db", bytes(range(256)) * 40 + bytes(4000), "this is not a text file"),
