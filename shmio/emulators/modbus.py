@@ -287,13 +287,14 @@ class ModbusEmulator:
         server.context = self._store
         connected = server.callback_new_connection
 
+        def make_room() -> None:
+            clients = list(server.active_connections.values())
+            if len(clients) > MAX_CLIENTS:  # end the oldest that has sent no request, or else the newest
+                next((one for one in clients if one.last_pdu is None), clients[-1]).close()
+
         def connect() -> Any:
-            handler = connected()
-            if len(server.active_connections) >= MAX_CLIENTS:
-                silent = (one for one in server.active_connections.values() if one.last_pdu is None)
-                # The oldest client that never sent a request makes room; else close the new one once it is connected.
-                server.loop.call_soon(server.loop.call_soon, next(silent, handler).close)
-            return handler
+            server.loop.call_soon(server.loop.call_soon, make_room)  # once the handler has its connection
+            return connected()
 
         server.callback_new_connection = connect
         if not await server.listen():

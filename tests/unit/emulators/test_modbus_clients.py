@@ -137,12 +137,17 @@ def test_all_sources_of_a_device_have_one_framing() -> None:
         emulator.change(served[1:])
 
 
-def test_clients_that_never_send_a_request_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clients_that_never_send_a_request_make_room(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr("shmio.emulators.modbus.MAX_CLIENTS", 2)
     with emulated("tcp") as (address, _), closing(Client(address, "tcp")) as working:
         assert working.ask("03 0000 0001") == "03 02 00 00"
+        for _ in range(20):  # they have left when the emulator looks for the one to end
+            socket.create_connection((address.host, address.port), 20).close()
         silent = socket.create_connection((address.host, address.port), 20)
         with silent, closing(Client(address, "tcp")) as other:
             assert other.ask("03 0000 0001") == "03 02 00 00"
             assert silent.recv(1) == b""
         assert working.ask("03 0000 0001") == "03 02 00 00"
+    assert not caplog.records
