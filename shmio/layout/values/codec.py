@@ -40,7 +40,7 @@ from shmio.errors import CharacterError, ValueRangeError
 from shmio.layout.encodings import TextEncoding, text_encoding
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values import calendar
-from shmio.wording import brief
+from shmio.wording import brief, counted
 
 Buffer = bytes | bytearray | memoryview
 Scalar = bool | int | float | str | None
@@ -328,7 +328,7 @@ class _Text:
     def encode(self, value: object) -> bytes:
         data = encode_text(value, self._encoding, self._name)
         if len(data) != self._size:
-            raise ValueRangeError(f"{self._name}: expected one character, found {brief(value)}")
+            raise ValueRangeError(f"{self._name}: expected one character of {counted(self._size, 'byte')} in {self._encoding.name}, found {brief(value)}")
         return data
 
 

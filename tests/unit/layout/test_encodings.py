@@ -104,7 +104,7 @@ def test_lengths_are_bytes_and_messages_name_the_encoding() -> None:
     with pytest.raises(CharacterError, match=r"\(windows-1252\) cannot hold '✓', character 2"):
         encode(layout_with("windows-1252").registers[0], "€✓")
     assert encode(layout_with("windows-1252").registers[0], "€")[0].data[:3] == b"\x08\x01\x80"
-    with pytest.raises(ValueRangeError, match="CHAR: expected one character"):
+    with pytest.raises(ValueRangeError, match="CHAR: expected one character of 1 byte in gbk"):
         encode(layout.registers[layout.by_path["c"]], "温")
     assert read_value("'温度'", register) == "温度"
 
