@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
@@ -23,6 +24,7 @@ from shmio.connectors.mqtt.faults import ValueFaultError
 from shmio.connectors.mqtt.quality import from_number
 from shmio.connectors.mqtt.topic import Found, Message, Origin
 from shmio.model.statuses import (
+    BAD_CONFIGURATION_ERROR,
     BAD_NO_COMMUNICATION,
     BAD_NOT_FOUND,
     BAD_WAITING_FOR_INITIAL_DATA,
@@ -159,6 +161,11 @@ class Device(Origin):
             found = error
         for index in self.wanted[known.name]:
             self._found[index] = found, message.order
+
+    def refuse(self, known: _Known, reason: str, message: Message) -> None:
+        """Make the registers of a metric bad until a message has the metric's value by its name."""
+        for index in self.wanted[known.name]:
+            self._found[index] = ValueFaultError(BAD_CONFIGURATION_ERROR, reason), message.order
 
     def command(self, values: Mapping[str, Any], now_ms: int) -> tuple[str, bytes]:
         """Return topic and payload of a command that sets metrics to values. ``values`` are by metric name.
@@ -333,16 +340,20 @@ class Node:
         aliases: dict[int, _Known | None] = {}
         if device is not None:
             device.begin(message.order)
+        counts = Counter(one.alias for one in payload.metrics if one.HasField("alias"))
         for one in payload.metrics:
             alias = one.alias if one.HasField("alias") else None
+            shared = alias is not None and counts[alias] > 1
             wanted = device is not None and one.name in device.wanted
-            known = _Known(one.name, alias, one.datatype, one.WhichOneof("value"))
+            known = _Known(one.name, None if shared else alias, one.datatype, one.WhichOneof("value"))
             if alias is not None:
-                aliases[alias] = known if wanted else None
+                aliases[alias] = known if wanted and not shared else None
                 self._check_alias(alias, name)
             if wanted and device is not None:
                 device.metrics[one.name] = known
                 device.take(known, one, message, _sent_ms(payload))
+                if shared:
+                    device.refuse(known, f"the birth of {device} has the alias {alias} for several metrics", message)
         if aliases:
             self._aliases[name] = aliases
         if sum(map(len, self._aliases.values())) > MAX_ALIASES:

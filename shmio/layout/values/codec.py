@@ -328,7 +328,10 @@ class _Text:
     def encode(self, value: object) -> bytes:
         data = encode_text(value, self._encoding, self._name)
         if len(data) != self._size:
-            raise ValueRangeError(f"{self._name}: expected one character of {counted(self._size, 'byte')} in {self._encoding.name}, found {brief(value)}")
+            size = counted(self._size, "byte")
+            raise ValueRangeError(
+                f"{self._name}: expected one character of {size} in {self._encoding.name}, found {brief(value)}"
+            )
         return data
 
 

@@ -18,6 +18,7 @@ from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode as to_writes
 from shmio.model.statuses import (
     BAD,
+    BAD_CONFIGURATION_ERROR,
     BAD_INDEX_RANGE_NO_DATA,
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
@@ -203,6 +204,18 @@ def test_an_alias_of_two_devices(caplog: pytest.LogCaptureFixture) -> None:
     assert (after.value("a"), after.status("a").code) == (3, GOOD)
     after.sparkplug("DDATA/N/a", metric(2, 9))  # its last birth does not have the alias
     assert after.status("a").code == BAD_WAITING_FOR_INITIAL_DATA
+
+
+def test_an_alias_of_two_metrics() -> None:
+    """Nobody knows which metric a value with this alias belongs to; a command names the metric."""
+    broker = Broker({name: ("INT", f"sparkplug G/N metric {name}") for name in "abc"})
+    broker.sparkplug("NBIRTH/N", metric(1, 7, "a"), metric(2, 7, "b"), metric(3, 8, "c"), metric(4, 8, "unread"))
+    broker.sparkplug("NDATA/N", metric(5, 7), metric(6, 8))
+    assert [broker.status(name).code for name in "abc"] == [BAD_CONFIGURATION_ERROR] * 3
+    broker.sparkplug("NDATA/N", metric(9, 7, "b"))
+    assert (broker.value("b"), broker.status("b").code, broker.status("a").code) == (9, GOOD, BAD_CONFIGURATION_ERROR)
+    command = wire.Payload.FromString(broker.store.command({0: 3})[1])
+    assert [(one.name, one.HasField("alias")) for one in command.metrics] == [("a", False)]
 
 
 def test_qualities() -> None:
