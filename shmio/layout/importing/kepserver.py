@@ -20,6 +20,10 @@ _WORD_ORDER: Final = (
     "the file does not say in which order the device has the words of numbers with 32 and 64 bits: KEPServerEX reads "
     'the low word first, unless the device\'s settings say otherwise; shmio does so with word_order = "little"'
 )
+_BIT_ORDER: Final = (
+    "the file does not say how the device's settings number the bits of words: KEPServerEX begins at 0, unless they say "
+    "otherwise; shmio begins at 0, so subtract 1 if the numbers are from 1 to 16"
+)
 
 
 def read(text: str) -> Found:
@@ -60,6 +64,8 @@ def _add(found: Found, row: Mapping[str, str], line: int, clamped: list[str]) ->
     element = element_type(place.kind)
     if place.modbus and element and element.base != "STRING" and element.size > 2 and _WORD_ORDER not in found.remarks:
         found.remarks.append(_WORD_ORDER)
+    if place.modbus and place.kind == "BOOL" and "." in place.address and _BIT_ORDER not in found.remarks:
+        found.remarks.append(_BIT_ORDER)
     if scale and any(row.get(clamp, "").lower() in _YES for clamp in _CLAMPS):
         clamped.append(f"{name} (line {line})")
     return found.add(

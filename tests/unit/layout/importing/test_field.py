@@ -614,3 +614,13 @@ def test_no_message_recommends_the_import_of_a_file_that_has_only_constants() ->
     assert "import" not in foreign("c.xml", data)
     tags = data.replace(b"PlcUserConstant", b"PlcTag").replace(b"<Value>3", b"<DataTypeName>Int</DataTypeName><Value>3")
     assert "shmio-layout import" in foreign("c.xml", tags)
+
+
+def test_settings_that_an_export_of_kepserverex_lacks_are_named() -> None:
+    """Manual "Modbus Ethernet", settings of a device."""
+    for address, data_type, wanted in (
+        ("400001", "Word", 0), ("400001.3", "Boolean", 1), ("400001", "Float", 1), ("000001", "Boolean", 0),
+        ("DB5,X0.3", "Boolean", 0),
+    ):  # fmt: skip
+        assert len(kep(address, data_type).remarks) == wanted, address
+    assert "numbers are from 1 to 16" in kep("400001.3", "Boolean").remarks[0]
