@@ -82,10 +82,12 @@ class Tag(NamedTuple):
     shape: tuple[int, ...]
     place: Any
     """Where the device has it, in the words of the rig."""
+    low: int = 0
+    """The first index of each dimension."""
 
     @property
     def type(self) -> str:
-        bounds = ", ".join(f"0..{length - 1}" for length in self.shape)
+        bounds = ", ".join(f"{self.low}..{self.low + length - 1}" for length in self.shape)
         return f"ARRAY[{bounds}] OF {self.kind}" if self.shape else self.kind
 
 
@@ -96,6 +98,12 @@ class Part(NamedTuple):
     elements: range
     bit: int | None
     shape: tuple[int, ...]
+
+
+Named = tuple[Tag, Part, Value]
+"""A write as a program asks for it: the register, the part, and the new value."""
+Writer = Callable[[Sequence[Named]], Sequence[str]]
+"""Writes to a device, and returns the outcomes: texts, which are empty if the write was accepted."""
 
 
 class Rig(Protocol):
@@ -110,8 +118,22 @@ class Rig(Protocol):
     def keys(self, tag: Tag, part: Part) -> set[Key]:
         """Return what a part of a register takes in the device."""
 
-    def writer(self, layout: Layout) -> AbstractContextManager[Callable[[Sequence[Write]], Sequence[str]]]:
-        """Return the function that writes to the device, and returns the outcomes."""
+    def writer(self, layout: Layout) -> AbstractContextManager[Writer]:
+        """Return the function that writes to the device."""
+
+
+def as_commands(layout: Layout, write: Callable[[Sequence[Write]], Sequence[str]]) -> Writer:
+    """Let each value be a command of its own, which a source's loop coalesces for its connector."""
+
+    def named(values: Sequence[Named]) -> Sequence[str]:
+        items = []
+        for number, (_, part, value) in enumerate(values):
+            writes = tuple(encode(find(layout, part.path), value, layout.byte_order))
+            items += [Item(Command(0, number, 0, 0, writes), place) for place in range(len(writes))]
+        batch, _ = coalesce(items, layout.size)
+        return write(batch)
+
+    return named
 
 
 def part_of(draw: st.DataObject, path: str, tag: Tag) -> Part:
@@ -129,11 +151,12 @@ def part_of(draw: st.DataObject, path: str, tag: Tag) -> Part:
     for length in reversed(shape[:-1]):
         row, place = divmod(row, length)
         index.insert(0, place)
-    path = "/".join([path, *map(str, index)])
+    path = "/".join([path, *(str(tag.low + place) for place in index)])
     if how == "slice":
         stop = draw.draw(st.integers(column, shape[-1] - 1))
-        return Part(f"{path}/{column}..{stop}", range(at, at + stop - column + 1), None, (stop - column + 1,))
-    path = f"{path}/{column}" if shape else path
+        columns = f"{tag.low + column}..{tag.low + stop}"
+        return Part(f"{path}/{columns}", range(at, at + stop - column + 1), None, (stop - column + 1,))
+    path = f"{path}/{tag.low + column}" if shape else path
     if how == "element":
         return Part(path, range(at, at + 1), None, ())
     bit = draw.draw(st.integers(0, bits - 1))
@@ -151,6 +174,8 @@ def value_of(draw: st.DataObject, kind: str, part: Part) -> Value:
         one = st.floats(width=32, allow_nan=False, allow_infinity=False)
     elif kind == "LREAL":
         one = st.floats(allow_nan=False, allow_infinity=False)
+    elif kind == "CHAR":
+        one = st.sampled_from("abcXYZ")
     else:
         one = st.text("abcXYZ", max_size=int(kind[7:-1]))
     for length in reversed(part.shape):
@@ -168,20 +193,15 @@ def check(rig: Rig, draw: st.DataObject) -> None:
             for path in draw.draw(st.lists(st.sampled_from(sorted(tags)), min_size=1, max_size=3)):
                 part = part_of(draw, path, tags[path])
                 parts.append((tags[path], part, value_of(draw, tags[path].kind, part)))
-            items = []
-            for number, (_, part, value) in enumerate(parts):  # each is a command of its own
-                writes = tuple(encode(find(layout, part.path), value, layout.byte_order))
-                items += [Item(Command(0, number, 0, 0, writes), place) for place in range(len(writes))]
-            batch, _ = coalesce(items, layout.size)
             before = rig.state()
-            outcomes = write(batch)
+            outcomes = write(parts)
             after = rig.state()
             named = set[Key]().union(*(rig.keys(tag, part) for tag, part, _ in parts))
             changed = {key for key in before.keys() | after.keys() if before.get(key) != after.get(key)}
             assert changed <= named, f"{[part.path for _, part, _ in parts]} changed {changed - named}: {tags}"
-            if len(parts) == 1 and not any(outcomes) and tags[path].kind in ("BOOL", *INTEGERS):
-                inverse = inverted(value, tags[path].kind)
-                assert not any(write(encode(find(layout, part.path), inverse, layout.byte_order)))
+            tag, part, value = parts[0]
+            if len(parts) == 1 and not any(outcomes) and tag.kind in ("BOOL", *INTEGERS):
+                assert not any(write([(tag, part, inverted(value, tag.kind))]))
                 last = rig.state()
                 assert {key for key in last if last[key] != after.get(key)} == named, part
 
@@ -204,7 +224,7 @@ def random_tags(
         kind, shape = draw.draw(st.sampled_from(kinds)), draw.draw(st.sampled_from(SHAPES))
         found = place(kind, shape)
         if found is not None:
-            tags[f"r{number}"] = Tag(kind, shape, found)
+            tags[f"r{number}"] = Tag(kind, shape, found, draw.draw(st.sampled_from([0, 0, 1])))
     return tags or {"r": Tag("BYTE", (), place("BYTE", ()))}
 
 
@@ -239,7 +259,7 @@ def s7_bits(tag: Tag, part: Part, start: int, first_bit: int = 0) -> set[int]:
     return bits
 
 
-S7_KINDS = ("BOOL", "BOOL", *SIZES, "STRING[3]", "STRING[4]")
+S7_KINDS = ("BOOL", "BOOL", *SIZES, "CHAR", "STRING[3]", "STRING[4]")
 S7_AREAS = {"%M": SrvArea.MK, "%Q": SrvArea.PA, "DB1.DB": SrvArea.DB}
 AREA_BYTES = 48
 
@@ -286,13 +306,13 @@ class S7Rig:
         return {(name, one) for one in s7_bits(tag, part, start, bit)}
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         address = self.server.address
         options = S7Options(host=address.host, port=address.port, dbNumber=None if layout.addressed else 7)
         connector: Any = S7Connector.for_layout(layout)(options, layout)
         try:
             connector.connect()
-            yield lambda writes: confirmed(connector, writes)
+            yield as_commands(layout, lambda writes: confirmed(connector, writes))
         finally:
             connector.close()
 
@@ -313,34 +333,48 @@ NAMES = {
     "n_numbers": ("zz/4", Tag("INT", (5,), (4, 0))),
 }
 """Names over an array of bytes: the address, and the register with its first byte and bit in the array."""
+MEMBERS = {
+    "a": Tag("BOOL", (), ()),
+    "b": Tag("BOOL", (), ()),
+    "c": Tag("CHAR", (3,), ()),
+    "d": Tag("BYTE", (), ()),
+    "e": Tag("BOOL", (9,), (), 1),
+}
+"""Members of a structure in each block."""
+
+
+def block(draw: st.DataObject) -> tuple[Layout, Mapping[str, Tag], int]:
+    """Draw the source of a data block, with a table of names over it.
+
+    Return the layout, the registers with their first byte and bit, and the end of the block.
+    """
+    tags = random_tags(draw, S7_KINDS, lambda kind, shape: ())
+
+    def declared(registers: Mapping[str, Tag]) -> str:
+        return "".join(f"{path} : {tag.type.title().replace(' Of ', ' of ')};\n" for path, tag in registers.items())
+
+    text = "DATA_BLOCK \"DB7\"\n{ S7_Optimized_Access := 'FALSE' }\nVERSION : 0.1\nSTRUCT\n"
+    text += f"{declared(tags)}m : Struct\n{declared(MEMBERS)}END_STRUCT;\nzz : Array[0..15] of Byte;\n"
+    text += "END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
+    names = "".join(
+        f'{path} = {{ address = "{address}", type = "{tag.type}" }}\n' for path, (address, tag) in NAMES.items()
+    )
+    files = [Source("DB7.db", text.encode()), Source("names.toml", f"[registers]\n{names}".encode())]
+    (layout,) = compile_sources(files).layouts
+    tags |= {f"m/{name}": tag for name, tag in MEMBERS.items()}
+    offsets = {one.path: (one.offset, one.bit or 0) for one in layout.registers}
+    zz, end = offsets["zz"][0], layout.size + 16
+    tags = {path: tag._replace(place=("block", *offsets[path])) for path, tag in tags.items()}
+    tags |= {path: tag._replace(place=("block", zz + tag.place[0], tag.place[1])) for path, (_, tag) in NAMES.items()}
+    return layout, tags | {"zz": Tag("BYTE", (16,), ("block", zz, 0))}, end
 
 
 class S7BlockRig(S7Rig):
     """The same controller; the layout is the source of a data block, with a table of names over it."""
 
     def layout(self, draw: st.DataObject) -> tuple[Layout, Mapping[str, Tag]]:
-        tags = random_tags(draw, S7_KINDS, lambda kind, shape: ())
-        members = "".join(
-            f"{path} : {'Array[' + ', '.join(f'0..{one - 1}' for one in tag.shape) + '] of ' if tag.shape else ''}"
-            f"{tag.kind.title()};\n"
-            for path, tag in tags.items()
-        )
-        members += "zz : Array[0..15] of Byte;\n"
-        text = f"DATA_BLOCK \"DB7\"\n{{ S7_Optimized_Access := 'FALSE' }}\nVERSION : 0.1\nSTRUCT\n{members}"
-        text += "END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
-        names = "".join(
-            f'{path} = {{ address = "{address}", type = "{tag.type}" }}\n' for path, (address, tag) in NAMES.items()
-        )
-        files = [Source("DB7.db", text.encode()), Source("names.toml", f"[registers]\n{names}".encode())]
-        (layout,) = compile_sources(files).layouts
-        self._end = layout.size + 16
+        layout, tags, self._end = block(draw)
         self.block[:] = random.Random(draw.draw(st.integers(0, 1 << 32))).randbytes(len(self.block))
-        offsets = {one.path: (one.offset, one.bit or 0) for one in layout.registers}
-        tags = {path: tag._replace(place=("block", *offsets[path])) for path, tag in tags.items()}
-        start, _ = offsets["zz"]
-        for path, (_, tag) in NAMES.items():
-            byte, bit = tag.place
-            tags[path] = tag._replace(place=("block", start + byte, bit))
         return layout, tags
 
     def state(self) -> Mapping[Key, object]:
@@ -355,15 +389,18 @@ class S7EmulatorRig(S7Rig):
     """The program of an emulated controller writes the values that it has changed."""
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         table = areas_module.TableMemory(layout)
         area_of = {"%M": Area.MARKER, "%Q": Area.OUTPUT, "DB1.DB": Area.BLOCK}
         memory = {(area_of[name], 1 if name == "DB1.DB" else 0): area for name, area in self.memory.items()}
-        yield lambda writes: stored(
+        yield as_commands(
             layout,
-            writes,
-            lambda frame: table.load(frame, memory),
-            lambda before, frame: table.store(before, frame, memory),
+            lambda writes: stored(
+                layout,
+                writes,
+                lambda frame: table.load(frame, memory),
+                lambda before, frame: table.store(before, frame, memory),
+            ),
         )
 
 
@@ -463,13 +500,13 @@ class ModbusRig:
         return keys
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         options: dict[str, Any] = {"word_order": self.orders[0], "byte_order": self.orders[1], "timeout": 20_000}
         address = self.address
         connector = ModbusConnector(ModbusOptions(host=address.host, port=address.port, **options), layout)
         try:
             connector.connect()
-            yield connector.write
+            yield as_commands(layout, connector.write)
         finally:
             connector.close()
 
@@ -478,14 +515,17 @@ class ModbusEmulatorRig(ModbusRig):
     """The program of an emulated device writes the values that it has changed."""
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         image = _TableImage(Served(layout, {"word_order": self.orders[0], "byte_order": self.orders[1]}))
         words = {(1, Table.COIL): self.device.coils, (1, Table.HOLDING): self.device.words}
-        yield lambda writes: stored(
+        yield as_commands(
             layout,
-            writes,
-            lambda frame: image.load(frame, words),
-            lambda before, frame: image.store(before, frame, words),
+            lambda writes: stored(
+                layout,
+                writes,
+                lambda frame: image.load(frame, words),
+                lambda before, frame: image.store(before, frame, words),
+            ),
         )
 
 
@@ -543,7 +583,7 @@ class MqttRig(MessageRig):
         return self._document
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         options = MqttOptions(url="mqtt://127.0.0.1", max_age_ms=0)
         store = Store(layout, options)
 
@@ -557,7 +597,7 @@ class MqttRig(MessageRig):
                 before = self._document
             return outcomes
 
-        yield write
+        yield as_commands(layout, write)
 
 
 def merged(document: Any, change: Any) -> Any:
@@ -589,7 +629,7 @@ class RosRig(MessageRig):
         return self._document
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         topics = Topics(layout, TopicOptions(max_age=0), known_types=False)
 
         def write(writes: Sequence[Write]) -> Sequence[str]:
@@ -600,10 +640,20 @@ class RosRig(MessageRig):
                 self._document[one.topic.name] = one.message
             return outcomes
 
-        yield write
+        yield as_commands(layout, write)
 
 
 # -- computed values ---------------------------------------------------------------------------------------------------
+
+
+def noise(draw: st.DataObject, size: int, tags: Mapping[str, Tag]) -> bytes:
+    """Draw an image of a block: any bits in its registers; its padding is zero."""
+    drawn, image = random.Random(draw.draw(st.integers(0, 1 << 32))), bytearray(size)
+    for tag in tags.values():
+        _, start, first = tag.place
+        for bit in s7_bits(tag, Part("", range(math.prod(tag.shape)), None, tag.shape), start, first):
+            image[bit // 8] |= drawn.randrange(2) << bit % 8
+    return bytes(image)
 
 
 class ImageRig:
@@ -614,12 +664,7 @@ class ImageRig:
         layout = place_tags("model", {path: {"type": tag.type} for path, tag in tags.items()}, "big")
         offsets = {one.path: (one.offset, one.bit or 0) for one in layout.registers}
         found = {path: tag._replace(place=("image", *offsets[path])) for path, tag in tags.items()}
-        noise = random.Random(draw.draw(st.integers(0, 1 << 32)))
-        image = bytearray(layout.size)  # the padding of an image is zero
-        for path, tag in found.items():
-            for _, bit in S7Rig.keys(self, tag, Part(path, range(math.prod(tag.shape)), None, tag.shape)):  # type: ignore[arg-type]
-                image[bit // 8] |= noise.randrange(2) << bit % 8  # type: ignore[operator]
-        self._image: Any = bytes(image)
+        self._image: Any = noise(draw, layout.size, found)
         return layout, found
 
     keys = S7Rig.keys
@@ -628,20 +673,20 @@ class ImageRig:
         return {("image", 8 * at + bit): byte >> bit & 1 for at, byte in enumerate(self._image) for bit in range(8)}
 
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         images = Images(layout, ())
         images.resume(self._image)
         self._image = images.commanded
-        yield images.write
+        yield as_commands(layout, images.write)
 
 
 class MemoryRig(ImageRig):
     @contextmanager
-    def writer(self, layout: Layout) -> Iterator[Callable[[Sequence[Write]], Sequence[str]]]:
+    def writer(self, layout: Layout) -> Iterator[Writer]:
         memory = Memory(Memory.Options(), layout)
         memory.resume(self._image)
         self._image = memory._image
-        yield memory.write
+        yield as_commands(layout, memory.write)
 
 
 RIGS: Mapping[str, Callable[[ExitStack], Any]] = {
@@ -657,10 +702,10 @@ RIGS: Mapping[str, Callable[[ExitStack], Any]] = {
 }
 
 
-def run(name: str, **given_settings: Any) -> None:
+def run(make: Callable[[ExitStack], Any], **given_settings: Any) -> None:
     """Check the property with drawn layouts and writes."""
     with ExitStack() as stack:
-        rig = RIGS[name](stack)
+        rig = make(stack)
 
         @settings(suppress_health_check=list(HealthCheck), deadline=None, database=None, **given_settings)
         @given(st.data())
@@ -672,7 +717,7 @@ def run(name: str, **given_settings: Any) -> None:
 
 @pytest.mark.parametrize("name", RIGS)
 def test_a_write_changes_exactly_what_it_names(name: str) -> None:
-    run(name)
+    run(RIGS[name])
 
 
 class WholeWords(WordCodec):
@@ -696,4 +741,4 @@ def test_a_connector_that_changes_neighbours_is_found(what: str, monkeypatch: py
     name, where, attribute, faulty = FAULTY[what]
     monkeypatch.setattr(where, attribute, faulty)
     with pytest.raises(AssertionError, match="changed"):
-        run(name, phases=[Phase.generate], max_examples=200, report_multiple_bugs=False)
+        run(RIGS[name], phases=[Phase.generate], max_examples=200, report_multiple_bugs=False)
