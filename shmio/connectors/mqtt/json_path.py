@@ -37,7 +37,7 @@ class Companion(NamedTuple):
 MAX_STEPS: Final = 16
 _STEP: Final = re.compile(
     r"""\.(?P<name>[^.\[\]'"]+)|\[(?P<index>[0-9]{1,6})\]|\['(?P<single>[^']+)'\]|\["(?P<double>[^"]+)"\]"""
-    r"""|\[(?P<key>[^.\[\]'"=]+)=(?:'(?P<quoted>[^']+)'|"(?P<quoted2>[^"]+)"|(?P<bare>[^\[\]'"]+))\]"""
+    r"""|\[(?P<key>[^.\[\]'"=]+)=(?:'(?P<quoted>[^']+)'|"(?P<quoted2>[^"]+)"|(?P<bare>[^\[\]'"=][^\[\]'"]*))\]"""
 )
 
 

@@ -21,8 +21,8 @@ _WORD_ORDER: Final = (
     'the low word first, unless the device\'s settings say otherwise; shmio does so with word_order = "little"'
 )
 _BIT_ORDER: Final = (
-    "the file does not say how the device's settings number the bits of words: KEPServerEX begins at 0, unless they say "
-    "otherwise; shmio begins at 0, so subtract 1 if the numbers are from 1 to 16"
+    "the file does not say how the device's settings number the bits of words: KEPServerEX begins at 0, unless they "
+    "say otherwise; shmio begins at 0, so subtract 1 if the numbers are from 1 to 16"
 )
 
 

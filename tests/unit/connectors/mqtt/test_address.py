@@ -45,7 +45,7 @@ def test_addresses(text: str, address: Address) -> None:
     [
         ("", "missing"), ("a/+/b", "one topic"), ("#", "one topic"), ("a $.", "from character 2"),
         ("a $.b[x]", "from character 4"), ("a $.b..c", "from character 4"),
-        ("a $[id=x]", "append a member"), ("a $[id=].v", "from character 2"),
+        ("a $[id=x]", "append a member"), ("a $[id=].v", "from character 2"), ("a $[id==x].v", "from character 2"),
          ("a $" + ".b" * 17, "16 steps"),
         ("a\0b", "control"), ("a" * 1001, "1000"), ("$share/g/a", "shared"), ("spBv1.0/G/DDATA/N/D", "sparkplug GROUP"),
         ("sparkplug G/N", "metric NAME"), ("sparkplug G metric a", "GROUP"), ("sparkplug G/N/D/E metric a", "GROUP/"),
