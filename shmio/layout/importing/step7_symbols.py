@@ -29,7 +29,7 @@ def read(text: str) -> Found:
     else:
         symbols = _separated(found, text)
     for line, symbol in symbols:
-        name, address, kind = symbol["name"], symbol["address"], symbol["type"].strip('"')
+        name, address, kind = symbol["name"], symbol["address"], symbol["type"]
         place = from_classic(address)
         if not name:
             found.skip("a row", "the row has no symbol", line)

@@ -624,3 +624,10 @@ def test_settings_that_an_export_of_kepserverex_lacks_are_named() -> None:
     ):  # fmt: skip
         assert len(kep(address, data_type).remarks) == wanted, address
     assert "numbers are from 1 to 16" in kep("400001.3", "Boolean").remarks[0]
+
+
+def test_a_tag_of_a_plc_data_type_in_a_list_is_named_as_such() -> None:
+    for row in ('"u","%I4.0","""Axis""","True","True","False","","","False"', 'u;"""Axis""";%I4.0'):
+        header = "Name;Type;Address\n" if ";" in row else ""
+        found = import_tags((header + row + "\n").encode())
+        assert [(why[:15], len(items)) for why, items in found.skipped.items()] == [("a PLC data type", 1)]
