@@ -199,6 +199,8 @@ class Placer:
         self._report = report
         self.placed: dict[str, Group | Unknown | None] = {}
         """The placed types by name in lower case; None for a type with errors."""
+        self._of_unit: dict[str, str] = {}
+        """For a type whose source names no software unit, the name with the unit by which a member has it."""
         self._open: dict[str, str] = {}  # names of the types that are being placed, by key
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
@@ -281,8 +283,16 @@ class Placer:
         if not name.quoted and (element := self._elementary(name)):
             return element
         key = name.name.lower()
-        if key not in self._types and key.rpartition(".")[2] in self._types:  # declared without its software unit
-            key = key.rpartition(".")[2]
+        if key not in self._types and (bare := key.rpartition(".")[2]) in self._types:  # its source names no unit
+            first = self._of_unit.setdefault(bare, name.name)
+            if first.lower() != key:
+                what = f"the sources have one type {self._types[bare].name!r} for both {first!r} and {name.name!r}"
+                unit, _, own = first.partition(".")
+                self._refuse(
+                    name.position, f'{what}; write the software unit in the source of each: TYPE "{unit}"."{own}"'
+                )
+                return None
+            key = bare
         if key not in self.placed and key in self._type_bytes and not self._by_name:
             self.placed[key] = _opaque(name, self._type_bytes[key])
         if key in self._open:

@@ -425,6 +425,15 @@ def test_types_of_software_units() -> None:
         given = f"TYPE {name} STRUCT p : Real; END_STRUCT END_TYPE".encode()
         [layout] = compile_sources([Source("u.db", block), Source("t.udt", given)]).layouts
         assert offsets(layout) == {"a/p": "0", "b/0/p": "4", "b/1/p": "8"}
+    one = Source("t.udt", b'TYPE "Axis" STRUCT p : Real; END_STRUCT END_TYPE')
+    other = Source("o.udt", b'TYPE "Other"."Axis" STRUCT q : Int; END_STRUCT END_TYPE')
+    two = Source(
+        "x.db", b'DATA_BLOCK "X" STRUCT a : "Tools"."Axis"; b : "Other"."Axis"; END_STRUCT BEGIN END_DATA_BLOCK'
+    )
+    with pytest.raises(LayoutError, match=r"one type 'Axis' for both 'Tools\.Axis' and 'Other\.Axis'"):
+        compile_sources([two, one])
+    [layout] = compile_sources([two, one, other]).layouts
+    assert offsets(layout) == {"a/p": "0", "b/q": "4"}
 
 
 def ml(members: str, head: str = "GlobalDB", more: str = "<Number>5</Number>", section: str = "Static") -> str:
