@@ -75,7 +75,7 @@ MODULES: Final[Mapping[str, str]] = {
 EMULATED: Final = ("layouts", "options")
 """The keys that say what an emulator serves. Their values can change while clients are connected."""
 
-RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
+RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client"), "web": ("token", "token_file")}
 """For each kind of process, the keys of its section that the process can read again while it runs."""
 
 AUDIT_FILE: Final = "audit.jsonl"
@@ -294,11 +294,11 @@ def make_plan(
     if config.fabric and mode != "log":
         sections += _fabric(config, config.fabric)
     http = {"folders": _folders(config), "token": msgspec.to_builtins(config.grpc.token) if config.grpc else []}
+    http["config_file"] = str(config_file.resolve())
     if config.metrics and mode != "log":
         sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | http))
     if config.web and mode != "log":
-        more = http | {"config_file": str(config_file.resolve())}
-        more["recordings"] = recordings and str(recordings)
+        more = http | {"recordings": recordings and str(recordings)}
         more["scene"] = scene  # in place of its path
         more["fabric"] = config.fabric and msgspec.to_builtins(Access.of(config.fabric, process=True))
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))

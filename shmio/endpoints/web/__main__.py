@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from shmio import worker
-from shmio.config import Address
+from shmio.config import Address, load
 from shmio.config.credentials import Secret, read_token, read_tokens
 from shmio.config.model import Metrics, Token, Web
 from shmio.config.web import check_library
+from shmio.endpoints.web.sessions import Sessions
+from shmio.errors import ShmioError
 from shmio.local.attach import attach
-from shmio.logs import rate_limited
+from shmio.logs import fields, rate_limited
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.web", "shmio.fabric", "uvicorn", "asyncio", "websockets", "nats")
@@ -36,11 +40,10 @@ async def _serve(worker: Worker) -> None:
     from shmio.endpoints.web.measurements import Measurements  # noqa: PLC0415
     from shmio.endpoints.web.served import Served  # noqa: PLC0415
     from shmio.endpoints.web.server import HttpServer  # noqa: PLC0415
-    from shmio.endpoints.web.sessions import Sessions  # noqa: PLC0415
     from shmio.endpoints.web.tabs import TABS  # noqa: PLC0415
 
     folders: dict[str, str] = worker.config.pop(FOLDERS)
-    given: list[dict[str, Any]] = worker.config.pop("token", [])
+    given = msgspec.convert(worker.config.pop("token", []), list[Token])
     file: str = worker.config.pop("config_file", "")
     recordings: str | None = worker.config.pop("recordings", None)
     scene: dict[str, Any] | None = worker.config.pop("scene", None)
@@ -51,10 +54,7 @@ async def _serve(worker: Worker) -> None:
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     measurements = Measurements(worker.segment)
     page = cell = served = None
-    tokens = read_tokens(msgspec.convert(given, list[Token]))
-    if config.token_file is not None:
-        tokens += (Secret(worker.name, frozenset({"read"}), read_token(worker.name, config.token_file)),)
-    sessions = Sessions(tokens, config.roles or ())
+    sessions = Sessions(_tokens(worker.name, given, config.token_file), config.roles or ())
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
         served = Served(worker.segment, cell, measurements, folders, file, recordings, scene, fabric)
@@ -74,6 +74,7 @@ async def _serve(worker: Worker) -> None:
     measurements.start()
     scheme = "https" if config.certificate else "http"
     worker.log.info("the server serves %s://%s/%s", scheme, server.address, "" if page else "metrics")
+    worker.on_reread(lambda: loop.call_soon_threadsafe(_take_anew, worker, Path(file), sessions))
     worker.running()
     while not stopping.is_set():
         counters = server.counters
@@ -89,6 +90,26 @@ async def _serve(worker: Worker) -> None:
     await asyncio.to_thread(measurements.stop)
     if cell is not None:
         cell.close()
+
+
+def _tokens(name: str, given: Sequence[Token], file: str | None) -> tuple[Secret, ...]:
+    """Read the tokens of ``[[grpc.token]]``, and the section's own one from its file."""
+    own = () if file is None else (Secret(name, frozenset({"read"}), read_token(name, file)),)
+    return read_tokens(given) + own
+
+
+def _take_anew(worker: Worker, file: Path, sessions: Sessions) -> None:
+    """Read the tokens again, and end the sessions of those that are gone."""
+    try:
+        config = load(file)
+        section = config.web if worker.name == "web" else config.metrics
+        if section is None:
+            return  # the supervisor is about to stop this process
+        ended = sessions.take(_tokens(worker.name, config.grpc.token if config.grpc else (), section.token_file))
+    except ShmioError as error:
+        worker.log.error("the server keeps its tokens as they were: %s", error)
+        return
+    worker.log.info("the server has read the tokens again", extra=fields(sessions_ended=ended))
 
 
 if __name__ == "__main__":

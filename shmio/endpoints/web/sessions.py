@@ -54,6 +54,7 @@ class User:
 @dataclass(slots=True)
 class _Session:
     user: User
+    secret: Secret
     opened_s: float
     ends: set[Callable[[], None]] = field(default_factory=set)
     """Functions that are called when the session is closed."""
@@ -82,6 +83,14 @@ class Sessions:
     def takes_tokens(self) -> bool:
         """True if there are tokens that users can show."""
         return bool(self._tokens)
+
+    def take(self, tokens: Sequence[Secret]) -> int:
+        """Replace the tokens. End the sessions whose tokens are gone or changed, and return their number."""
+        self._tokens = tokens
+        gone = [key for key, one in self._users.items() if one.secret not in tokens]
+        for key in gone:
+            self._ended(self._users.pop(key))
+        return len(gone)
 
     def user(self, cookie: str | None, host: str) -> User:
         """Return the user of the session with this cookie on this host; an anonymous user if there is none."""
@@ -114,11 +123,12 @@ class Sessions:
             The session's cookie, and the user; None if there is no such token.
 
         """
-        user = self.owner(token, host)
-        if user is None:
+        secret = self._secret(token)
+        if secret is None:
             return None
+        user = self._user(secret, host)
         cookie = secrets.token_urlsafe(32)
-        self._users[digest(cookie.encode())] = _Session(user, self._now())
+        self._users[digest(cookie.encode())] = _Session(user, secret, self._now())
         if len(self._users) > MAX_SESSIONS:
             most, _ = Counter(one.user.client for one in self._users.values()).most_common(1)[0]
             oldest = next(key for key, one in self._users.items() if one.user.client == most)
@@ -127,11 +137,18 @@ class Sessions:
 
     def owner(self, token: str, host: str) -> User | None:
         """Return the owner of a token; None if there is no such token. The time that this takes depends on no token."""
-        shown, owner = digest(token.strip().encode()), None
+        secret = self._secret(token)
+        return None if secret is None else self._user(secret, host)
+
+    def _secret(self, token: str) -> Secret | None:
+        shown, found = digest(token.strip().encode()), None
         for secret in self._tokens:
             if hmac.compare_digest(secret.digest, shown):
-                owner = secret
-        return None if owner is None else User(owner.name, owner.roles | self._anonymous, host)
+                found = secret
+        return found
+
+    def _user(self, secret: Secret, host: str) -> User:
+        return User(secret.name, secret.roles | self._anonymous, host)
 
     def close(self, cookie: str) -> None:
         """Close the session with this cookie, and its pages."""

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from shmio.config import Alert, Config, Emulator, Grpc, Instance, Mqtt, Recorder, Source, Token
+from shmio.config.model import Metrics
 from shmio.errors import ConfigError
 from shmio.layout.document import load_layout
 from shmio.layout.model import Layout, Register
@@ -97,6 +98,17 @@ def test_tokens_do_not_change_the_identity_of_the_process(tmp_path: Path) -> Non
     assert plain.identify("a50", 7) == guarded.identify("a50", 7) != job(insecure=True).identify("a50", 7)
     assert plain.describe("a50", 7) != guarded.describe("a50", 7)
     assert (plain.rules, "token" in json.loads(guarded.describe("a50", 7))["config"]) == ({}, True)
+
+
+def test_tokens_do_not_change_the_identity_of_what_serves_metrics(tmp_path: Path) -> None:
+    def job(token_file: str) -> Job:
+        changed = config(tmp_path)
+        changed.metrics = Metrics(listen="127.0.0.1:9090", token_file=token_file)
+        return make_plan(changed, {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml").jobs[-1]
+
+    one, other = job("one"), job("other")
+    assert one.identify("a50", 7) == other.identify("a50", 7)
+    assert one.rules == {"token_file": "one"}, "a reload signals it"
 
 
 def test_log_mode_has_a_recorder_and_no_endpoint(tmp_path: Path) -> None:
