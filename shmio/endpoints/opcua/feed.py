@@ -12,7 +12,7 @@ from asyncua.ua.ua_binary import struct_to_binary
 from shmio.endpoints.opcua import values
 from shmio.endpoints.opcua.commands import CommandClient
 from shmio.layout.model import Register
-from shmio.model.statuses import standard, status_area
+from shmio.model.statuses import status_area
 from shmio.segment import Block, Frame, FrameFollower, Quality, QualityChange
 from shmio.segment.changed_registers import ChangeScan, entries
 from shmio.segment.doorbell import TURN_NS
@@ -230,7 +230,7 @@ class Feed:
         frame = self.follower.frame
         return ua.DataValue(
             None if state.value is None else values.variant(register, state.value),
-            ua.StatusCode(standard(state.code)),
+            ua.StatusCode(state.code),
             values.moment(state.source_ns) if state.source_ns else None,
             values.moment(frame.source_ns) if frame is not None and frame.source_ns else None,
         )

@@ -16,6 +16,7 @@ from shmio.model.statuses import (
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
     quality_of,
+    standard,
     status_area,
 )
 from shmio.segment import Block, Frame, FrameFollower, Provenance, Quality
@@ -186,8 +187,8 @@ def register_state(follower: FrameFollower, register: Register, injected: Sequen
         status = area.get(frame.image, area.index(register))
         source_ns = status.source_ns or source_ns
         if status.quality is Quality.BAD:
-            return RegisterState(None, status.code, source_ns)
-        code = code or status.code
+            return RegisterState(None, standard(status.code), source_ns)
+        code = code or standard(status.code)
     value = codec(register, block.layout.byte_order).decode(frame.image)
     if holds_none(value):
         return RegisterState(None, BAD_DECODING_ERROR, source_ns)

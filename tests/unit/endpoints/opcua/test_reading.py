@@ -149,6 +149,11 @@ def test_each_register_has_the_status_and_time_that_its_device_gives(instance: s
             one.publish(frame(0x808C0000, 3_000_000_000))
             bad = await changes.until("cell/b", lambda value: value.StatusCode.is_bad())
             assert (bad.StatusCode.name, bad.SourceTimestamp.timestamp()) == ("BadSensorFailure", 3)
+            for found, code in ((0x51000200, 0x40000000), (0x91010000, 0x803C0000)):  # Uncertain, BadOutOfRange
+                one.publish(frame(found, 4_000_000_000))
+                await changes.until("cell/b", lambda value, code=code: value.StatusCode.value == code)  # type: ignore[misc]
+                read = await node(client, "cell/b").read_data_value(raise_on_bad_status=False)
+                assert read.StatusCode.value == code
             assert [path for path, _ in changes.seen].count("cell/a") == 1
             assert (await node(client, "cell/a").read_data_value()).SourceTimestamp.timestamp() == 1
 
