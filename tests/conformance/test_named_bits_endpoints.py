@@ -38,7 +38,8 @@ from tests.unit.endpoints.harness import WRITER as GRPC
 from tests.unit.endpoints.opcua import harness as opcua
 from tests.unit.endpoints.opcua.conftest import standard_nodes  # noqa: F401  used by all tests of this module
 from tests.unit.endpoints.opcua.harness import WRITER as OPCUA
-from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.plant import GUEST, Plant
+from tests.unit.endpoints.web.test_page import pages, said
 
 SOURCES = 6
 EXAMPLES: dict[str, Any] = {
@@ -257,11 +258,34 @@ def index_range(shape: tuple[int, ...], elements: range) -> str:
     return ",".join(texts)
 
 
+class WebPage(Sources):
+    """The web page's call: values as text."""
+
+    process = "web"
+    writer_number = GUEST
+
+    def serve(self, stack: ExitStack) -> None:
+        server = stack.enter_context(pages(self.segment, roles=("read", "write")))
+        self._browser = stack.enter_context(server.open())
+
+    def write(self, values: Sequence[Named]) -> Sequence[str]:
+        return [self._set(part.path, value) for _, part, value in values]
+
+    def _set(self, path: str, value: Any) -> str:
+        text = value if isinstance(value, str) else json.dumps(value)
+        told = said(self._browser, "registers.set", path=f"{self.source}/{path}", value=text)
+        if "error" in told:
+            return str(told["error"])
+        found = told["result"]
+        return "" if found["outcome"] == "written" else found["reason"] or found["outcome"]
+
+
 RIGS: Mapping[str, Callable[[ExitStack, str], Any]] = {
     "simlog v1": SimlogV1,
     "simlog v2": SimlogV2,
     "shmio.v1": ShmioV1,
     "opcua": OpcUa,
+    "web page": WebPage,
 }
 
 
@@ -286,6 +310,7 @@ FAULTY: Mapping[str, tuple[str, Any, str, Any]] = {
     "simlog v2 writes whole bytes": ("simlog v2", writer_module, "encode", whole_bytes),
     "shmio.v1 writes whole bytes": ("shmio.v1", writer_module, "encode", whole_bytes),
     "opcua writes whole bytes": ("opcua", writer_module, "encode", whole_bytes),
+    "the web page writes whole bytes": ("web page", writer_module, "encode", whole_bytes),
     "opcua takes the next element": (
         "opcua",
         index_range_module,
