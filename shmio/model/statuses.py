@@ -98,7 +98,10 @@ def _found(code: int) -> str:
     match code >> 24:
         case Finding.CHARACTER:
             character = "a character" if detail & 0xFFFF == 0xFFFF else repr(chr(detail & 0xFFFF))
-            return f"the register's encoding cannot hold {character}, which is character {detail >> 16} of the text"
+            return (
+                f"the register's encoding cannot hold {character}, which is character {detail >> 16} of the text; "
+                "set the source's key encoding to one that can"
+            )
         case Finding.UNKNOWN_QUALITY:
             return f"the device states the quality {detail}, which has no meaning"
         case Finding.UNREADABLE_TIME:
@@ -249,6 +252,12 @@ _NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources us
 }
 
 
+_OF_EITHER: Final = frozenset({
+    BAD_DECODING_ERROR, BAD_INDEX_RANGE_NO_DATA, BAD_NOT_FOUND, BAD_OUT_OF_RANGE, BAD_TYPE_MISMATCH,
+})  # fmt: skip
+"""Codes that a source also sets by itself, for a value that it cannot read or that does not fit its register."""
+
+
 class RegisterStatus(NamedTuple):
     """The status that the source gave a register.
 
@@ -278,6 +287,8 @@ class RegisterStatus(NamedTuple):
             return f"no data yet ({_NAMES[BAD_WAITING_FOR_INITIAL_DATA]})"
         if self.quality is Quality.GOOD:
             return ""
+        if self.code & _NAMED in _OF_EITHER:
+            return f"{describe(self.code)}, from the device or from the source, whose log then has the reason"
         return _found(self.code) or f"the device reports {describe(self.code)}"
 
 

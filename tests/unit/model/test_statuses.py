@@ -82,9 +82,9 @@ def test_a_layout_without_a_status_area_has_none(layout: Layout) -> None:
 def test_findings_of_a_source_have_a_severity_a_reason_and_a_standard_code() -> None:
     for code, quality, reason, expected in (
         (character_missing(3, "✓"), Quality.BAD,
-         "the register's encoding cannot hold '✓', which is character 3 of the text", BAD_OUT_OF_RANGE),
+         "the register's encoding cannot hold '✓', which is character 3 of the text; set the source's key encoding to one that can", BAD_OUT_OF_RANGE),
         (character_missing(300, "\U0001f600"), Quality.BAD,
-         "the register's encoding cannot hold a character, which is character 255 of the text", BAD_OUT_OF_RANGE),
+         "the register's encoding cannot hold a character, which is character 255 of the text; set the source's key encoding to one that can", BAD_OUT_OF_RANGE),
         (Finding.UNKNOWN_QUALITY.code(512), Quality.UNCERTAIN,
          "the device states the quality 512, which has no meaning", UNCERTAIN),
         (Finding.UNREADABLE_TIME.code(), Quality.UNCERTAIN,
@@ -94,3 +94,9 @@ def test_findings_of_a_source_have_a_severity_a_reason_and_a_standard_code() -> 
         assert (status.quality, status.reason, standard(code)) == (quality, reason, expected)
     for code in (0, BAD_OUT_OF_RANGE, 0x80340400, 0xC0000000):
         assert standard(code) == code
+
+
+def test_a_status_that_the_source_may_have_found_is_not_said_to_be_the_devices() -> None:
+    reason = RegisterStatus(BAD_OUT_OF_RANGE, 0).reason
+    assert reason == ("BadOutOfRange (0x803C0000), from the device or from the source, whose log then has the reason")
+    assert RegisterStatus(BAD_NODE_ID_UNKNOWN, 0).reason == "the device reports BadNodeIdUnknown (0x80340000)"
