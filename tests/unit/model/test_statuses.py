@@ -80,11 +80,12 @@ def test_a_layout_without_a_status_area_has_none(layout: Layout) -> None:
 
 
 def test_findings_of_a_source_have_a_severity_a_reason_and_a_standard_code() -> None:
+    remedy = "set the source's key encoding to one that can"
     for code, quality, reason, expected in (
         (character_missing(3, "✓"), Quality.BAD,
-         "the register's encoding cannot hold '✓', which is character 3 of the text; set the source's key encoding to one that can", BAD_OUT_OF_RANGE),
+         f"the register's encoding cannot hold '✓', which is character 3 of the text; {remedy}", BAD_OUT_OF_RANGE),
         (character_missing(300, "\U0001f600"), Quality.BAD,
-         "the register's encoding cannot hold a character, which is character 255 of the text; set the source's key encoding to one that can", BAD_OUT_OF_RANGE),
+         f"the register's encoding cannot hold a character, which is character 255 of the text; {remedy}", BAD_OUT_OF_RANGE),
         (Finding.UNKNOWN_QUALITY.code(512), Quality.UNCERTAIN,
          "the device states the quality 512, which has no meaning", UNCERTAIN),
         (Finding.UNREADABLE_TIME.code(), Quality.UNCERTAIN,

@@ -117,7 +117,8 @@ def test_a_text_that_the_registers_encoding_cannot_hold_says_so(
     try:
         with connected(device.url, {"text": "STRING[20]", "mode": "INT"}) as source:
             assert source.status("text").reason == (
-                "the register's encoding cannot hold '✓', which is character 4 of the text; set the source's key encoding to one that can"
+                "the register's encoding cannot hold '✓', which is character 4 of the text; "
+                "set the source's key encoding to one that can"
             )
             assert source.status("mode").code == GOOD
         (said,) = [record.getMessage() for record in caplog.records]
