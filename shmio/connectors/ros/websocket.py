@@ -64,7 +64,9 @@ class _Envelope(msgspec.Struct):
 
 
 _envelope = msgspec.json.Decoder(_Envelope)
-_TOPIC: Final = re.compile(rb'"op"\s*:\s*"publish".{0,1000}?"topic"\s*:\s*("(?:[^"\\]|\\.){1,256}")', re.DOTALL)
+_NAME: Final = rb'"topic"\s*:\s*("(?:[^"\\]|\\.){1,256}")'
+_PUBLISH: Final = rb'"op"\s*:\s*"publish"'
+_TOPIC: Final = re.compile(_PUBLISH + rb".{0,1000}?" + _NAME + rb"|" + _NAME + rb"\s*,\s*" + _PUBLISH, re.DOTALL)
 _UNREADABLE: Final = (ValueError, RecursionError)
 """What decoders raise for text that is not JSON."""
 
@@ -357,9 +359,10 @@ def _read(text: bytes) -> _Envelope | None:
 
 def _unreadable(text: bytes) -> _Envelope | None:
     """Return an empty message of the topic that a text names; None if it names none."""
-    with contextlib.suppress(*_UNREADABLE):
-        if found := _TOPIC.search(text):
-            return _Envelope("publish", json.loads(found[1]))
+    for part in (text[:_HEAD_BYTES], text[-_HEAD_BYTES:]):  # the message may precede the name; all of it is too long
+        with contextlib.suppress(*_UNREADABLE):
+            if found := _TOPIC.search(part):
+                return _Envelope("publish", json.loads(found[1] or found[2]))
     return None
 
 

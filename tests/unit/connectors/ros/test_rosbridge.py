@@ -142,6 +142,13 @@ def test_a_message_that_cannot_be_read_is_bad_alone(bridge: Bridge) -> None:
             bridge.ask("raw", head + message)
             source.until(lambda: source.code("j1") == statuses.BAD_DECODING_ERROR)
             assert source.code("other") == 0, message
+        for message in (
+            '{"topic": "/joint_states", "op": "publish", "msg": nan}', f'{{"msg": nan{" " * 5000}, {head[1:42]}}}',
+        ):  # fmt: skip
+            bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0]))
+            source.until(lambda: source.code("j1") == 0 == source.code("other"))
+            bridge.ask("raw", message)
+            source.until(lambda: source.code("j1") == statuses.BAD_DECODING_ERROR)
 
 
 def test_a_message_that_is_too_large_is_bad_alone(bridge: Bridge, caplog: pytest.LogCaptureFixture) -> None:
