@@ -430,7 +430,7 @@ def test_a_slow_dry_run_delays_no_reload_and_another_one_waits_for_its_own_plan(
     with socket.socket(socket.AF_UNIX) as first, socket.socket(socket.AF_UNIX) as second:
         for client in (first, second):
             client.settimeout(DEADLINE_S)
-            client.connect(path)
+        first.connect(path)
         first.sendall(b'{"do": "reload", "dry_run": true}\n')
         held: list[int] = []
 
@@ -441,6 +441,7 @@ def test_a_slow_dry_run_delays_no_reload_and_another_one_waits_for_its_own_plan(
         until(hold)
         pipe.unlink()
         assert cell.reload([*CELL, PRESS])["done"] == ["press: started"]
+        second.connect(path)  # only now: a client that sends no request is disconnected
         second.sendall(b'{"do": "reload", "dry_run": true}\n')
         cell.request(Where())  # the supervisor has read what was sent before
         cell.plan(CELL)
