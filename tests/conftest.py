@@ -83,6 +83,7 @@ ONE_AFTER_THE_OTHER = (
 START_PROCESSES = (
     "tests/compatibility/test_client.py",
     "tests/compatibility/test_segment.py",
+    "tests/conformance/test_named_bits_processes.py",
     "tests/native/",
     "tests/system/",
     "tests/unit/cli/test_campaign_run.py",
