@@ -24,7 +24,7 @@ KEPSERVER: Final = "tag name"
 SHEET: Final = "PLC Tags"
 """The sheet with the tags in a workbook of TIA Portal."""
 _ROOT: Final = re.compile(r"(?>\s*<(?:\?[^>]*>|!--.*?-->))*+\s*<(?:[\w.-]+:)?([\w.-]+)", re.DOTALL)
-_IN_DOCUMENT: Final = re.compile(r"<SW\.(?:Blocks\.(?:GlobalDB|InstanceDB)|Tags\.PlcTag)\b")
+_IN_DOCUMENT: Final = re.compile(r"<SW\.(?:Blocks\.(?:GlobalDB|InstanceDB)|Tags\.PlcTag|ControllerTag)\b")
 _MAX_LIST_OF_SHEETS: Final = 1 << 20
 _INSTEAD: Final = (
     "in TIA Portal, open the context menu of the data block, choose 'Generate source from blocks', and name the "

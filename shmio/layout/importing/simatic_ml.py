@@ -23,6 +23,9 @@ from shmio.layout.values.literal import default_text, parse_literal, scalar_lite
 
 ROOT: Final = "Document"
 _BLOCKS: Final = ("SW.Blocks.GlobalDB", "SW.Blocks.InstanceDB")
+_TABLES: Final = ("SW.Tags.PlcTagTable", "SW.ControllerTagTable")
+_TAGS: Final = ("SW.Tags.PlcTag", "SW.ControllerTag")
+"""Tables and their tags; the second name is that of TIA Portal V13."""
 _MAX_INITIAL: Final = 1000
 """Maximum number of elements of an array whose initial values are imported."""
 
@@ -59,7 +62,7 @@ def read(
         else:
             sources.append(Source(source.file, source.text, source.encoding or encoding))
     blocks = [(file, node) for file, one in roots.items() for tag in _BLOCKS for node in one.iter(tag)]
-    tables = list(root.iter("SW.Tags.PlcTagTable"))
+    tables = [node for node in root.iter() if node.tag in _TABLES]
     for node in root.iter("SW.Blocks.ArrayDB"):
         found.skip(attribute(node, "Name"), "an ARRAY data block is not supported", node.line)
     if not tables and not blocks:
@@ -67,8 +70,9 @@ def read(
         raise ImportingError(f"expected a PLC tag table or a data block, found {others}")
     for table in tables:
         for node in table.iter():
-            if node.tag == "SW.Tags.PlcTag":
+            if node.tag in _TAGS:
                 tag, kind, address = (attribute(node, one) for one in ("Name", "DataTypeName", "LogicalAddress"))
+                kind = kind or (node.findtext("LinkList/DataType/Name") or "").strip()
                 writable = attribute(node, "ExternalWritable").lower() == "true"
                 add_plc_tag(found, tag, kind, address, node.line, comment=comment_of(node), writable=writable)
             elif node.tag == "SW.Tags.PlcUserConstant":

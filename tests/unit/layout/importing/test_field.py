@@ -640,3 +640,15 @@ def test_a_tag_of_a_plc_data_type_in_a_list_is_named_as_such() -> None:
         header = "Name;Type;Address\n" if ";" in row else ""
         found = import_tags((header + row + "\n").encode())
         assert [(why[:15], len(items)) for why, items in found.skipped.items()] == [("a PLC data type", 1)]
+
+
+def test_tags_of_tia_portal_v13() -> None:
+    """Their names are others, and a link has the type."""
+    data = (
+        b"<Document><SW.ControllerTagTable><ObjectList><SW.ControllerTag><AttributeList><LogicalAddress>%I0.3"
+        b"</LogicalAddress><Name>Guard</Name></AttributeList><LinkList><DataType TargetID='@OpenLink'><Name>Bool</Name>"
+        b"</DataType></LinkList></SW.ControllerTag></ObjectList></SW.ControllerTagTable></Document>"
+    )
+    for text in (data, data.replace(b"SW.Controller", b"SW.Tags.Plc")):
+        assert places(import_tags(text)) == {"Guard": ("Bool", "%I0.3")}
+        assert "shmio-layout import" in foreign("x.xml", text)
