@@ -163,6 +163,8 @@ APART = (
     "tests/system/test_mtconnect_package.py",
     "tests/system/test_opcua_gateway.py",
     "tests/system/test_umati.py",
+    # a load of each endpoint; test_turns.py, test_shares.py and the endpoints' own tests hold the limits
+    "tests/system/test_one_client_too_many.py",
     # 20 busy loops would disturb the tests beside it; test_policy.py has recorded figures of such a load
     "tests/unit/supervisor/test_overload.py",
     # every byte of a file; the tests beside them cut and change it at chosen places

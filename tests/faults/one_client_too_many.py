@@ -1,9 +1,14 @@
 """Loads each endpoint with one client of the role ``read``: ``python -m tests.faults.one_client_too_many --for 60``.
 
 The client sends the heaviest load that the endpoint allows. Another client, with a token of its own, makes one
-request after the other on one connection: first alone, then beside the load. The table has the delays of its
-requests, how often its connection failed, how much of its data was lost, and how often the supervisor restarted
-the process.
+request after the other on one connection: beside a busy processor, then beside the load. The table has the delays
+of its requests, how often its connection failed, how much of its data was lost, and how often the supervisor
+restarted the process.
+
+The load yields to the other processes (``NICE``), as if it ran on another host. So that the reference has the same
+conditions, loops that yield as much keep the processors busy meanwhile. The table has
+the processor time that the load and the endpoint's process have used: if the endpoint used little, the load was not
+heavy, because the host was busy or because the endpoint gave it no more.
 
 To add an endpoint, add a row to ``ENDPOINTS``: the name of its process, a function that loads it until its
 process is terminated, and a context manager that connects the other client, and yields a function that makes a
@@ -17,6 +22,8 @@ import asyncio
 import hashlib
 import http.client
 import json
+import math
+import os
 import secrets
 import shutil
 import statistics
@@ -54,6 +61,8 @@ CALL_S: Final = 60.0
 REGISTER: Final = "cell/Robot_800/Axs1_Pos"
 WIDE: Final = ("cell/Inputs", "cell/Outputs")
 """The largest registers."""
+NICE: Final = 10
+"""What the load adds to its nice value, nice(2)."""
 PAUSE_S: Final = 0.02
 """Time between two requests of the other client: one in each cycle of the source."""
 MORE: Final = """
@@ -131,6 +140,16 @@ class Result:
     before: Delays
     during: Delays
     restarts: int
+    load: float
+    """Processors that the load has used."""
+    endpoint: float
+    """Processors that the endpoint's process has used beside the load."""
+
+    @property
+    def times(self) -> str:
+        """How many times longer the delays are beside the load."""
+        medians = [statistics.median(one.delays_ms) for one in (self.before, self.during) if one.delays_ms]
+        return f"{medians[1] / medians[0]:.1f} times" if len(medians) == 2 else "-"
 
     @property
     def faults(self) -> list[str]:
@@ -597,29 +616,67 @@ def measured(ask: Callable[[], object], for_s: float) -> Delays:
     return found
 
 
+def yield_to_others() -> None:
+    """Let other processes go first, also where the kernel schedules by sessions, sched(7)."""
+    if os.sched_getscheduler(0) == os.SCHED_RR:  # chrt -r 2 keeps the other programs of a busy host away
+        os.sched_setparam(0, os.sched_param(1))
+    os.setsid()
+    os.nice(NICE)
+    with suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(NICE))
+
+
+@contextmanager
+def beside(*arguments: str) -> Iterator[int]:
+    """Run this program as a load, and yield its pid when the load begins."""
+    command = [sys.executable, "-m", "tests.faults.one_client_too_many", *arguments]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as load:
+        try:
+            assert load.stdout is not None
+            load.stdout.readline()
+            yield load.pid
+        finally:
+            load.kill()
+
+
+@contextmanager
+def busy_processors() -> Iterator[None]:
+    """Keep all processors busy, with processes that yield to others."""
+    with ExitStack() as stack:
+        for _ in os.sched_getaffinity(0):
+            stack.enter_context(beside("--busy"))
+        yield
+
+
+def used_s(pid: int) -> float:
+    """Return the processor time in s that a process has used, proc(5); NaN if it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return math.nan
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def run(cell: Cell, place: Place, name: str, for_s: float, alone_s: float) -> Result:
     """Load an endpoint of a running cell, and return the result."""
     endpoint = ENDPOINTS[name]
     before = cell.processes()
     with endpoint.other(place) as ask:
         ask()
-        alone = measured(ask, alone_s)
-        command = [sys.executable, "-m", "tests.faults.one_client_too_many", "--load", json.dumps(asdict(place)), name]
-        load = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        try:
-            assert load.stdout is not None
-            with load.stdout:
-                load.stdout.readline()  # the load begins
-            beside = measured(ask, for_s)
-        finally:
-            load.kill()
-            load.wait()
+        with busy_processors():
+            alone = measured(ask, alone_s)
+        with beside("--load", json.dumps(asdict(place)), name) as load:
+            pids = load, before[endpoint.process]["pid"]
+            begun_s, begun = time.monotonic(), [used_s(pid) for pid in pids]
+            during = measured(ask, for_s)
+            lasted_s = time.monotonic() - begun_s
+            used = [used_s(pid) - one for pid, one in zip(pids, begun, strict=True)]
     after = cell.processes()
     restarts = sum(
         one["pid"] != before[process]["pid"] or one["restarts"] > before[process]["restarts"]
         for process, one in after.items()
     )
-    return Result(alone, beside, restarts)
+    return Result(alone, during, restarts, *(one / lasted_s for one in used))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -629,31 +686,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--alone", dest="alone_s", type=float, default=10.0, metavar="SECONDS")
     parser.add_argument("endpoint", nargs="*", help=f"which ones: {', '.join(ENDPOINTS)} (default: all)")
     parser.add_argument("--load", type=json.loads, help=argparse.SUPPRESS)  # the process that is the load
+    parser.add_argument("--busy", action="store_true", help=argparse.SUPPRESS)  # a process that is only busy
     given = parser.parse_args(arguments)
-    if given.load is not None:
+    if given.busy or given.load is not None:
+        yield_to_others()
         print("begun", flush=True)
+        while given.busy:
+            pass
         ENDPOINTS[given.endpoint[0]].load(Place(**given.load))
     faults = 0
     with (
         tempfile.TemporaryDirectory() as folder,
         started(Path(folder), f"many-{secrets.token_hex(3)}") as (cell, place),
     ):
-        print("| endpoint | delay alone, ms: median / 95 % / most | beside the load | median | requests | faults |")
-        print("|---|---|---|---|---|---|", flush=True)
+        print("| endpoint | delay in ms alone: median / 95 % / most | beside the load | median | requests", end="")
+        print(" | processors used by load and endpoint | faults |\n|---|---|---|---|---|---|---|", flush=True)
         for name in given.endpoint or ENDPOINTS:
             found = run(cell, place, name, given.for_s, given.alone_s)
             faults += len(found.faults)
-            times = (
-                f"{statistics.median(found.during.delays_ms) / statistics.median(found.before.delays_ms):.1f} times"
-                if found.during.delays_ms and found.before.delays_ms
-                else "-"
-            )
             texts = (
                 name,
                 found.before,
                 found.during,
-                times,
+                found.times,
                 len(found.during.delays_ms),
+                f"{found.load:.2f}, {found.endpoint:.2f}",
                 "; ".join(found.faults) or "none",
             )
             print(f"| {' | '.join(map(str, texts))} |", flush=True)
