@@ -32,6 +32,7 @@ import socket
 import stat
 import struct
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -277,6 +278,13 @@ class ControlServer:
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def _accept(self) -> None:
+        """Accept the clients that wait, at least one, and no more than there is room for."""
+        for _ in range(MAX_CLIENTS):
+            if not self._accept_one() or len(self._clients) >= MAX_CLIENTS:
+                return
+
+    def _accept_one(self) -> bool:
+        """Accept a client; return False if none waits."""
         try:
             client, _ = self._listener.accept()
         except OSError as error:
@@ -284,7 +292,7 @@ class ControlServer:
                 _log.error("the control socket accepts nobody now: %s", error.strerror)
                 self._selector.unregister(self._listener)
                 self._resting = True
-            return
+            return False
         client.setblocking(False)
         peer = _peer(client)
         if peer.uid not in (0, os.getuid()):
@@ -297,15 +305,19 @@ class ControlServer:
         else:
             self._clients[client] = bytearray(), time.monotonic() + REQUEST_S
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
+        return True
 
     def _has_room(self) -> bool:
         """Return whether another client can connect.
 
-        If needed, first disconnect the client that has been silent longest.
+        If needed, first disconnect a silent client: of the program that has most of them, the one silent longest.
         """
-        silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
-        if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
-            self.answer(longest, {"error": _TOO_MANY})
+        if len(self._clients) >= MAX_CLIENTS:
+            silent = {client: _peer(client).pid for client, (_, due) in self._clients.items() if due is not None}
+            if silent:
+                most, _ = Counter(silent.values()).most_common(1)[0]
+                longest = next(client for client, pid in silent.items() if pid == most)
+                self.answer(longest, {"error": _TOO_MANY})
         return len(self._clients) < MAX_CLIENTS
 
     def _receive(self, client: socket.socket) -> None:

@@ -18,7 +18,7 @@ import msgspec
 import pytest
 
 from shmio import control
-from shmio.control import Answer, ControlServer, Request, Restart, Stop, Where
+from shmio.control import Answer, ControlServer, Peer, Request, Restart, Stop, Where
 from shmio.errors import ControlError
 
 
@@ -356,3 +356,27 @@ def test_hostile_answers_raise_a_control_error(tmp_path: Path, answer: bytes) ->
         with pytest.raises(ControlError):
             control.request(str(path), Stop(), 60)
         serving.join()
+
+
+def test_a_busy_program_makes_room_before_another_one(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the silent clients, one of the program that has most of them is dropped, not the one silent longest."""
+    pids: dict[socket.socket, int] = {}
+    monkeypatch.setattr(control, "_peer", lambda one: Peer(pids.setdefault(one, min(len(pids), 1)), os.getuid()))
+    other, *busy = (served.client() for _ in range(control.MAX_CLIENTS + 1))
+    assert answer_to(busy[0]) == {"error": "too many control connections at once"}
+    other.sendall(b'{"do": "where"}\n')
+    served.turn()
+    assert len(served.requests) == 1
+    for client in (other, *busy):
+        client.close()
+
+
+def test_all_clients_that_wait_are_accepted_at_once(served: Served) -> None:
+    waiting = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(control.MAX_CLIENTS)]
+    for client in waiting:
+        client.connect(served.path)
+    ((accept, _),) = served.selector.select(0)
+    accept.data()
+    assert served.selector.select(0) == []
+    for client in waiting:
+        client.close()
