@@ -19,7 +19,7 @@ from asyncua.ua.ua_binary import header_from_binary, uatcp_to_binary
 from shmio.audit import trail
 from shmio.audit.trail import Acting, Actor
 from shmio.endpoints.opcua.requests import SERVICES, Service, decode, encode
-from shmio.endpoints.opcua.shares import Share
+from shmio.endpoints.shares import Share
 from shmio.logs import fields
 
 MAX_CONNECTIONS: Final = 100

@@ -13,7 +13,7 @@ from asyncua.ua import ua_binary
 from asyncua.ua.ua_binary import Primitives, nodeid_to_binary, struct_to_binary
 from asyncua.ua.uatypes import type_from_list, type_is_list
 
-from shmio.endpoints.opcua.shares import Share
+from shmio.endpoints.shares import Share
 
 MAX_NODES: Final = 10_000
 """Maximum number of nodes, items or paths in a request. The server's OperationLimits contain this number."""

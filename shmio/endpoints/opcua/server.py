@@ -37,9 +37,9 @@ from shmio.endpoints.opcua.connection import (
 )
 from shmio.endpoints.opcua.requests import MAX_CALLS, MAX_NODES, MAX_WRITES
 from shmio.endpoints.opcua.session import Session
-from shmio.endpoints.opcua.shares import Shares
 from shmio.endpoints.opcua.space import Space
 from shmio.endpoints.opcua.subscriptions import Subscriptions
+from shmio.endpoints.shares import Shares
 from shmio.errors import EndpointError
 from shmio.version import __version__
 from shmio.wording import cannot_listen

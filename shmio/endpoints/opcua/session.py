@@ -20,8 +20,8 @@ from shmio.audit.trail import Actor
 from shmio.endpoints.opcua.access import User
 from shmio.endpoints.opcua.nodes import Method, RegisterNode, bad
 from shmio.endpoints.opcua.parts import plain, registers_of_part
-from shmio.endpoints.opcua.shares import Share
 from shmio.endpoints.opcua.subscriptions import Subscription
+from shmio.endpoints.shares import Share
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten

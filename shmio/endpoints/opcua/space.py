@@ -23,7 +23,7 @@ from shmio.endpoints.opcua.nodes import (
     VariableNode,
 )
 from shmio.endpoints.opcua.parts import PartOfVariable, check_range
-from shmio.endpoints.opcua.shares import Share
+from shmio.endpoints.shares import Share
 from shmio.errors import PathError
 from shmio.layout.topic import find
 

@@ -27,7 +27,7 @@ from asyncua.ua.uaprotocol_auto import DataChangeFilter  # ua.DataChangeFilter i
 
 from shmio.endpoints.opcua.feed import Watch
 from shmio.endpoints.opcua.requests import MAX_OWN_ITEMS, MAX_OWN_SUBSCRIPTIONS
-from shmio.endpoints.opcua.shares import ALL_SHARE, BYTE_S, CLIENT_SHARE, Share, Shares
+from shmio.endpoints.shares import ALL_SHARE, BYTE_S, CLIENT_SHARE, Share, Shares
 
 MIN_PUBLISHING_MS: Final = 20.0
 MAX_PUBLISHING_MS: Final = 60_000.0

@@ -59,7 +59,7 @@ class Call(NamedTuple):
 
     role: str
     arguments: type[msgspec.Struct]
-    function: Callable[[Any, Any], Awaitable[Any]]
+    function: Callable[[Any, Any], Coroutine[Any, Any, Any]]
 
 
 _Arguments = TypeVar("_Arguments", bound=msgspec.Struct)
@@ -181,6 +181,8 @@ class Page:
         self.user = user
         self.host: str = socket.headers["host"]
         """How the browser names this server: host and port."""
+        self.turn = served.turns.of(user.client)
+        """What the user's client has of the server's time."""
         self._socket = socket
         self._tabs = {tab.name: tab(self) for tab in tabs}
         self._calls = {name: (call, tab) for tab in self._tabs.values() for name, call in tab.calls.items()}
@@ -204,7 +206,7 @@ class Page:
             lasts_s: Time in s after which the user's session ends; None if it does not end.
 
         """
-        sender = self.start(self._send())
+        sender = self._start(self._send())
         try:
             async with self._limit:
                 await self._socket.accept()
@@ -241,11 +243,16 @@ class Page:
     async def _serve(self, message: str | None) -> None:
         while message is not None:
             await self._room.acquire()
-            self.start(self._answer(message))
+            self._start(self._answer(message))
             message = await self._receive()
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run work in the background. It is cancelled when the page is closed."""
+        """Run work in the background, in the client's turns. It is cancelled when the page is closed."""
+        task = self._start(self.turn.run(work))
+        task.add_done_callback(lambda _: work.close())  # the page may be closed before the work begins
+        return task
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._done)
@@ -303,9 +310,10 @@ class Page:
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
                 raise ShmioError(f"the call is malformed: {error}") from None
             in_turn = made.role == "read" and (tab.takes_turns or message.call.endswith(".follow"))
-            async with self.served.turns.of(self.user.client) if in_turn else nullcontext():
+            async with self.turn if in_turn else nullcontext():
                 with attempt or nullcontext():
-                    result = await made.function(tab, arguments)
+                    work = made.function(tab, arguments)
+                    result = await (self.turn.run(work) if made.role == "read" else work)
                     if attempt is not None:
                         attempt.end(*_outcome(result))
                 answer = msgspec.json.encode({"id": number, "result": result})
@@ -333,12 +341,14 @@ class Page:
                 await self._waiting.wait()
                 self._waiting.clear()
                 while self._answers:
-                    await self._socket.send_text(self._sent(self._answers.popleft()).decode())
+                    text = self._sent(self._answers.popleft()).decode()
+                    await self.turn.share.count(self._socket.send_text(text))  # the call has had its turn
                     self._room.release()
                 while self._newest:
-                    await self._socket.send_text(self._sent(self._newest.pop(next(iter(self._newest)))).decode())
+                    text = self._sent(self._newest.pop(next(iter(self._newest)))).decode()
+                    await self.turn.run(self._socket.send_text(text))
                 while self._batches and not self._answers:
-                    await self._socket.send_bytes(self._sent(self._batches.popleft()))
+                    await self.turn.run(self._socket.send_bytes(self._sent(self._batches.popleft())))
 
     def _sent(self, message: bytes) -> bytes:
         self.served.messages += 1

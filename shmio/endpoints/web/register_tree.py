@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shmio.layout.model import Layout, Register
 from shmio.segment import Block
+
+STEP_ROWS: Final = 32
+"""Number of rows between which a search lets others proceed."""
 
 
 class Row(NamedTuple):
@@ -67,8 +69,10 @@ class Trees:
     def __init__(self) -> None:
         self._trees: dict[int, Node] = {}
         self._making = threading.Lock()
-        self.looking = asyncio.Lock()
-        """Held while rows are searched, because simultaneous searches would delay the data of all pages."""
+
+    def present(self, block: Block) -> Node | None:
+        """Return the tree of a block if it has been made."""
+        return self._trees.get(block.section)
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
         """Return the tree of a block. If a new tree is made, drop the trees of blocks that are not in ``blocks``."""
@@ -122,10 +126,10 @@ class Window(NamedTuple):
     marked: Row | None
 
 
-def window(visible: Iterator[Row], first: int, count: int, most: int, marked: str = "") -> Window:
-    """Return ``count`` rows, beginning with number ``first``, and the row whose path is ``marked``, if it is visible.
+def window(visible: Iterator[Row], first: int, count: int, most: int, marked: str = "") -> Iterator[Window | None]:
+    """Find ``count`` rows, beginning with number ``first``, and the row whose path is ``marked``, if it is visible.
 
-    Rows are counted only up to ``most``.
+    Rows are counted only up to ``most``. The iterator yields None after each ``STEP_ROWS`` rows, and then the result.
     """
     shown: list[Row] = []
     total, found = 0, None
@@ -135,4 +139,6 @@ def window(visible: Iterator[Row], first: int, count: int, most: int, marked: st
         if row.path == marked:
             found = row
         total += 1
-    return Window(shown, total, found)
+        if not total % STEP_ROWS:
+            yield None
+    yield Window(shown, total, found)

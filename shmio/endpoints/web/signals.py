@@ -19,8 +19,8 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from starlette.concurrency import run_in_threadpool
 
+from shmio.endpoints.turns import Turn
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.frame_codec import FrameCodec
@@ -52,6 +52,9 @@ _log = logging.getLogger("shmio.web")
 
 class Follower(Protocol):
     """Receives the batches of feeds."""
+
+    turn: Turn
+    """What the follower's client has of the server's time."""
 
     def take(self, batch: bytes) -> None:
         """Receive a batch. The follower may drop it."""
@@ -238,7 +241,7 @@ class Feeds:
             self._number += 1
             feed = self._feeds[key] = Feed(self._number, block, registers, self.utc_ns)
         last = feed.last
-        batches, before = await run_in_threadpool(feed.history, last)
+        batches, before = await follower.turn.in_thread(feed.history, last)
         self._feeds[key] = feed  # it may have been removed, because nobody followed it yet
         feed.send()
         for batch in chain(batches, feed.between(before, last + 1, feed.last)):
@@ -262,14 +265,21 @@ class Feeds:
             self._feeds.clear()
 
     async def _send(self) -> None:
-        """Send new frames at intervals, while pages follow any."""
+        """Send new frames at intervals, while pages follow any. The first follower with time left pays for the feed."""
         while True:
             await asyncio.sleep(INTERVAL_S)
             for key, feed in list(self._feeds.items()):
                 if not feed.followers:
-                    del self._feeds[key]
-                elif not _sent(feed):
-                    del self._feeds[key]
+                    self._feeds.pop(key, None)
+                    continue
+                await asyncio.sleep(0)
+                payer = next((one for one in feed.followers if not one.turn.share.wait_s), None)
+                if payer is None:  # the feed's frames wait in the ring; if there are too many, they become a gap
+                    continue
+                with payer.turn.share:
+                    alive = _sent(feed)
+                if not alive:
+                    self._feeds.pop(key, None)
                     for follower in tuple(feed.followers):
                         follower.end(feed.number)
                         self.leave(feed, follower)

@@ -96,7 +96,7 @@ class Injections(FollowedTab):
     @call("read", Given)
     async def check(self, given: Given) -> list[dict[str, Any]]:
         """Check a campaign, and return the injections that it would make. Nothing is started."""
-        return await run_in_threadpool(self._preview, given.text)
+        return await self.page.turn.in_thread(self._preview, given.text)
 
     @call("read", Typed)
     async def condition(self, given: Typed) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class Injections(FollowedTab):
             before, present = present, {source: block.injections.read() for source, block in blocks.items()}
             if present != before:
                 names = {one["pid"]: one["name"] for one in self.page.served.overview()["processes"]}
-                self.page.push("injections", await run_in_threadpool(self._describe, present, names))
+                self.page.push("injections", await self.page.turn.in_thread(self._describe, present, names))
             earlier, events = events, self.page.served.timeline.events()
             if events != earlier:
                 self.page.push("events", events)

@@ -7,7 +7,6 @@ from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
-from starlette.concurrency import run_in_threadpool
 
 from shmio.endpoints.web.page import Tab, call
 from shmio.local.log_files import last_lines, parse_line
@@ -42,7 +41,7 @@ class Log(Tab):
         names = ["supervisor", *(slot.name for slot in served.segment.processes)]
         chosen = [name for name in names if given.process in ("", name)]
         files = [Path(served.folders["logs"]) / f"{name}.log" for name in chosen]
-        return await run_in_threadpool(_lines, files, given)
+        return await self.page.turn.in_thread(_lines, files, given)
 
 
 def _lines(files: list[Path], given: Wanted) -> list[dict[str, Any]]:

@@ -60,6 +60,7 @@ class Plots(Tab):
 
     def __init__(self, page: Page) -> None:
         super().__init__(page)
+        self.turn = page.turn
         self._feeds: dict[str, Feed] = {}
         self._changing = asyncio.Lock()
         self._past: dict[str, dict[int, Work[Part]]] = {}

@@ -79,7 +79,7 @@ class Registers(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._cell: Attachment = page.served.cell
-        self._looking = asyncio.Lock()
+        self._looking, self._reading = asyncio.Lock(), asyncio.Lock()
         self._allowed: dict[int, bytes] = {}
         self._visible: list[tuple[str, Block, Register]] = []
         self._sent: dict[str, list[Any]] = {}
@@ -98,14 +98,18 @@ class Registers(Tab):
 
         From now on, send the values of these rows whenever they change.
         """
-        async with self._looking, self.page.served.trees.looking:  # one search at a time for a page, and for all pages
-            rows, total, marked = await run_in_threadpool(self._rows, given)
+        async with self._looking:  # one search at a time
+            rows, total, marked = await self._rows(given)
         followed = rows if marked is None or marked in rows else [*rows, marked]
-        self._show([row.path for row in followed if row.register is not None])
+        await self._show([row.path for row in followed if row.register is not None])
+        described = []
+        for row in rows:
+            described.append(self._describe(row))
+            await self.page.turn.pause()
         return {
             "first": given.first,
             "total": total,
-            "rows": [self._describe(row) for row in rows],
+            "rows": described,
             "marked": None if marked is None else self._describe(marked),
         }
 
@@ -114,7 +118,7 @@ class Registers(Tab):
         """From now on, send the values of these registers, instead of those of the rows."""
         for path in given.paths:
             self._cell.resolve(path)
-        self._show(given.paths)
+        await self._show(given.paths)
 
     @call("write", Given)
     async def set(self, given: Given) -> dict[str, str]:
@@ -145,11 +149,11 @@ class Registers(Tab):
             raise PathError(f"{given.path}: this page does not override it; the tab Injections lifts others")
         await run_in_threadpool(shadow.close)
 
-    def _show(self, paths: Iterable[str]) -> None:
+    async def _show(self, paths: Iterable[str]) -> None:
         self._find(paths)
         if self._sending is None:
             self._sending = self.page.start(self._send())
-        self._send_values()
+        await self._send_values()
 
     def _find(self, paths: Iterable[str]) -> None:
         """Find the registers whose values are sent, in the present layouts."""
@@ -165,19 +169,23 @@ class Registers(Tab):
             text = msgspec.json.encode(text).decode()
         return f"{block.source}/{register.path}", read_value(text, register)
 
-    def _rows(self, given: Shown) -> Window:
+    async def _rows(self, given: Shown) -> Window:
         blocks = self.page.served.segment.blocks
         expanded = frozenset(blocks if given.expanded is None else given.expanded)
+        trees = [(await self._tree(block), block.layout) for block in tuple(blocks.values())]
         visible: Iterator[Row] = chain.from_iterable(
-            matching(self._tree(block), block.layout, given.filter)
-            if given.filter
-            else rows(self._tree(block), block.layout, expanded)
-            for block in blocks.values()
+            matching(tree, layout, given.filter) if given.filter else rows(tree, layout, expanded)
+            for tree, layout in trees
         )
-        return window(visible, given.first, given.count, MAX_COUNTED, given.marked)
+        search = window(visible, given.first, given.count, MAX_COUNTED, given.marked)
+        while (found := next(search)) is None:
+            await self.page.turn.pause()
+        return found
 
-    def _tree(self, block: Block) -> Node:
-        return self.page.served.trees.of(block, self.page.served.segment.blocks.values())
+    async def _tree(self, block: Block) -> Node:
+        trees, blocks = self.page.served.trees, self.page.served.segment.blocks.values()
+        present = trees.present(block)
+        return present if present is not None else await self.page.turn.in_thread(trees.of, block, blocks)
 
     def _describe(self, row: Row) -> dict[str, Any]:
         described: dict[str, Any] = {
@@ -212,29 +220,32 @@ class Registers(Tab):
     async def _send(self) -> None:
         while True:
             await asyncio.sleep(INTERVAL_S)
-            self._send_values()
+            await self._send_values()
 
-    def _send_values(self) -> None:
+    async def _send_values(self) -> None:
         """Send the values of all visible rows, if one has changed.
 
         Unchanged values are sent, too, because a newer message replaces one that is not sent yet.
         """
-        self.page.served.segment.refresh()
-        blocks = self.page.served.segment.blocks
-        if any(blocks.get(block.source, block).section != block.section for _, block, _ in self._visible):
-            self.page.push("layout", None)  # a reload has replaced a block, so registers may have moved
-            self._find([path for path, _, _ in self._visible])
-            return
-        frames = {block.section: block.latest() for block in blocks.values()}
-        values: dict[str, list[Any]] = {}
-        ages: dict[str, float | None] = {}
-        for path, block, register in self._visible:
-            if block.section in frames:
-                found = reading(block, register, frames[block.section])
-                values[path], ages[path] = [*_value(found), found.source_time], found.age_s
-        if values != self._sent:
-            self._sent = values
-            self.page.push("registers", {path: [*shown[:-1], ages[path]] for path, shown in values.items()})
+        async with self._reading:
+            self.page.served.segment.refresh()
+            blocks = self.page.served.segment.blocks
+            visible = self._visible
+            if any(blocks.get(block.source, block).section != block.section for _, block, _ in visible):
+                self.page.push("layout", None)  # a reload has replaced a block, so registers may have moved
+                self._find([path for path, _, _ in visible])
+                return
+            frames = {block.section: block.latest() for block in blocks.values()}
+            values: dict[str, list[Any]] = {}
+            ages: dict[str, float | None] = {}
+            for path, block, register in visible:
+                if block.section in frames:
+                    found = reading(block, register, frames[block.section])
+                    values[path], ages[path] = [*_value(found), found.source_time], found.age_s
+                    await self.page.turn.pause()
+            if visible is self._visible and values != self._sent:
+                self._sent = values
+                self.page.push("registers", {path: [*shown[:-1], ages[path]] for path, shown in values.items()})
 
 
 def _value(found: Reading) -> list[Any]:

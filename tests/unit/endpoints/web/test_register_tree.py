@@ -80,6 +80,9 @@ def test_window_counts_rows_up_to_a_limit_and_finds_the_marked_one() -> None:
         (0, 5, 3, 5, None),
         (20, 100, 0, 10, marked),
     ):
-        window_ = window(iter(many), first, 3, most, "b")
+        *_, window_ = window(iter(many), first, 3, most, "b")
+        assert window_ is not None
         assert (len(window_.rows), window_.total, window_.marked) == (shown, total, found), (first, most)
-    assert window(iter(many), 7, 3, 100).rows == [row, row, marked]
+    *_, last = window(iter(many), 7, 3, 100)
+    assert last is not None
+    assert last.rows == [row, row, marked]

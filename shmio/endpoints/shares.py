@@ -104,6 +104,11 @@ class Share:
         self._credit_s -= number * BYTE_S
         self._recent_s += number * BYTE_S
 
+    def count_time(self, used_s: float) -> None:
+        """Count time in s that another thread has used for the client."""
+        self._credit_s -= used_s
+        self._recent_s += used_s
+
     def _refill(self, now_s: float) -> None:
         self._credit_s = min(BURST_S, self._credit_s + (now_s - self._at_s) * self._shares.rate)
         self._at_s = now_s

@@ -9,8 +9,8 @@ import pytest
 from asyncua import ua
 
 from shmio.endpoints.opcua.requests import decode
-from shmio.endpoints.opcua.shares import ALL_SHARE, ALONE_SHARE, BURST_S, BYTE_S, CLIENT_SHARE, SLICE_S, Share, Shares
 from shmio.endpoints.opcua.subscriptions import ITEM_S, Costs, Subscription
+from shmio.endpoints.shares import ALL_SHARE, ALONE_SHARE, BURST_S, BYTE_S, CLIENT_SHARE, SLICE_S, Share, Shares
 
 
 class Clock:
