@@ -68,7 +68,7 @@ def reader(request: pytest.FixtureRequest, tmp_path: Path, instance: str) -> Ite
 
 @pytest.mark.parametrize("reader", ["emulate-an-s7-plc.md"], indirect=True)
 def test_the_page_on_emulated_controllers_runs_as_shown(reader: Reader) -> None:
-    (source,), (configuration, apart) = reader.all("scl"), reader.all("toml")
+    (source,), (configuration, apart, _) = reader.all("scl"), reader.all("toml")  # the last has a profile
     reader.write("my.db", source)
     reader.write("supervisor.toml", configuration)
     *steps, (unplug, nothing) = reader.steps()
