@@ -89,6 +89,17 @@ class Acting:
     endpoint: str
     refused: bool = False
 
+    @property
+    def text(self) -> str:
+        """Who acts, and from where, in the words of ``shmio-supervisor audit``."""
+        return words_of(self.endpoint, self.actor.kind, self.actor.name, self.actor.origin)
+
+
+def words_of(endpoint: str, kind: str, name: str, origin: str) -> str:
+    """Return who acts through an endpoint, as text for users."""
+    who = f"{kind} {name}".rstrip()
+    return f"{endpoint}: {who} ({origin})" if origin else f"{endpoint}: {who}"
+
 
 _present: ContextVar[Acting | None] = ContextVar("acting", default=None)
 
@@ -109,6 +120,11 @@ def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
         yield found
     finally:
         _present.reset(before)
+
+
+def present() -> Acting | None:
+    """Return the actor of this task or thread; None if no client is known."""
+    return _present.get()
 
 
 def uid_actor(uid: int | None, origin: str) -> Actor:
@@ -231,6 +247,15 @@ class Attempt:
         """Number of the command; 0 if none was sent."""
         self.event = 0
         """Number of the source's event that ended the command; 0 if it is not known."""
+
+    @contextmanager
+    def acting(self) -> Iterator[None]:
+        """Make the attempt's actor the actor of this task or thread within a ``with`` block."""
+        before = _present.set(self._who)
+        try:
+            yield
+        finally:
+            _present.reset(before)
 
     def __enter__(self) -> Attempt:
         return self

@@ -271,7 +271,9 @@ def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
         for first, count in _runs([item for item, _ in group]):
             command, (offset, mask, data) = first.command, first.write
-            yield Record(kind, text, command.writer, command.id, first.place, count, offset, mask, len(data))
+            yield Record(
+                kind, text, command.writer, command.id, first.place, count, offset, mask, len(data), by=command.by
+            )
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
@@ -587,7 +589,7 @@ class CommandProcessor:
         write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
         if not reason and command.kind is CommandKind.NOTE:
-            self._writer.event(Record(EventKind.NOTED, command.name, command.writer, command.id, 0, 1))
+            self._writer.event(Record(EventKind.NOTED, command.name, command.writer, command.id, 0, 1, by=command.by))
             return True
         if not reason and layer is not None:
             reason = uncovered(layer, command.writes)
@@ -597,7 +599,7 @@ class CommandProcessor:
             reason = self._injections.overload
         if reason:
             count = max(1, len(command.writes))
-            record = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)
+            record = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count, by=command.by)
             if write:
                 offset, mask, data = command.writes[0]
                 record = record._replace(offset=offset, mask=mask, size=len(data))

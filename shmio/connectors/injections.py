@@ -645,7 +645,7 @@ class InjectionProcessor:
                 return reason
             layer.values = self.injections.before(self._output.base, layer)
             above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
-            end = layer_event(EventKind.INJECTED, layer, command.name)
+            end = layer_event(EventKind.INJECTED, layer, command.name, command)
             self._output.show([*self._publisher.inner_values(above, end), *self._publisher.created(layer, end)])
         return ""
 

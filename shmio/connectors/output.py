@@ -334,7 +334,7 @@ class LayerPublisher:
         The events precede ``end``, the last event of the command that caused the change.
         """
         for layer in layers:
-            record = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
+            record = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id, by=end.by)
             yield from _parts(record, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
@@ -404,7 +404,7 @@ def pieces(
 ) -> Iterator[Record]:
     """Yield events with the data of ``writes``, which are parts of an item. A long part needs several events."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
-    return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
+    return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number, by=command.by), writes)
 
 
 def _parts(record: Record, writes: Iterable[Write]) -> Iterator[Record]:
@@ -421,5 +421,7 @@ def in_parts(record: Record, document: bytes) -> Iterator[Record]:
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
     """Return an event about an injection, caused by ``command``, or by the injection's owner if that is None."""
-    writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
-    return Record(kind, text, writer, number, 0, 1, injection=layer.id)
+    writer, number, by = (
+        (layer.owner.writer, layer.id, "") if command is None else (command.writer, command.id, command.by)
+    )
+    return Record(kind, text, writer, number, 0, 1, injection=layer.id, by=by)

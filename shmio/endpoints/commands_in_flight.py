@@ -11,7 +11,7 @@ from shmio.audit.trail import Attempt
 from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, PendingCommand
 from shmio.segment import DONE, Event, EventKind
 from shmio.segment.commands import CommandOutcomes, End, worst
-from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.segment.events import EVENT_DATA_SIZE, MAX_BY_BYTES
 
 MAX_OPEN: Final = 512
 """Maximum number of events that all commands in flight may still cause.
@@ -50,7 +50,7 @@ class CommandCost(NamedTuple):
 
         """
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)
-        return cls(64 + 4 * len(name) + sum(24 + size for size in sizes), events)
+        return cls(80 + MAX_BY_BYTES + 4 * len(name) + sum(24 + size for size in sizes), events)
 
 
 @dataclass(slots=True)

@@ -16,7 +16,6 @@ writable, and occupies one of the external slots of the process table.
 from __future__ import annotations
 
 import os
-import sys
 import threading
 import time
 import weakref
@@ -36,7 +35,7 @@ from shmio.model.clock import Clock, check_step
 from shmio.model.values import Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
-from shmio.segment.processes import Activity, Report
+from shmio.segment.processes import Activity, Report, program_name
 from shmio.segment.segment import Segment, running_instances
 from shmio.wording import name_one, unknown
 
@@ -741,8 +740,7 @@ def _take_external_slot(segment: Segment) -> int:
     places = segment.processes.external
     for slot in places:
         if slot.writer is not None and slot.take():
-            program = sys.argv[0].rpartition("/")[2] if sys.argv else ""  # not the arguments, which may be secret
-            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns(), (os.getuid(),), program)
+            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns(), (os.getuid(),), program_name())
             return slot.writer
     pids = ", ".join(str(slot.report.pid) for slot in places)
     raise SegmentError(

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Final, Unpack
 
 import msgspec
 
+from shmio.audit import trail
 from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge, path_at, paths_outside
-from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
+from shmio.model.values import ROLES, WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
 from shmio.segment.commands import (
     EMPTY,
     MAX_NAME_BYTES,
@@ -30,6 +31,7 @@ from shmio.segment.commands import (
     first_number,
 )
 from shmio.segment.events import Event, EventKind
+from shmio.segment.processes import program_name
 from shmio.wording import MAX_PATHS, not_writable
 
 if TYPE_CHECKING:
@@ -91,7 +93,9 @@ class CommandSender:
             if not number:
                 number, self._next = self._next, self._next + 1
             incarnation = self.block.incarnation
-            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **options)
+            command = Command(
+                self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **options, by=self._by()
+            )
             record = command.pack()
             queues = self.block.commands
             if len(record) + 8 > queues.capacity:
@@ -106,6 +110,18 @@ class CommandSender:
                     f"{source}: its command queue is full: the source is not reading commands, or too many are queued"
                 )
             return number
+
+    def _by(self) -> str:
+        """Return who sends a command: the client of this task or thread, or else this program."""
+        acting = trail.present()
+        if acting is not None:
+            return acting.text
+        return "" if self.writer in ROLES else self._program  # readers name the endpoint by its queue
+
+    @cached_property
+    def _program(self) -> str:
+        actor = trail.uid_actor(os.getuid(), f"pid {self._pid} {program_name()}".rstrip())
+        return trail.Acting(actor, "local").text
 
 
 class PendingCommand(msgspec.Struct):

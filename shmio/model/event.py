@@ -81,8 +81,10 @@ class Event(msgspec.Struct, frozen=True):
         text: A reason, the note, or the name of the injection or snapshot, depending on the kind.
         injection: Number of the injection that the event is about; 0: none.
         command: Number of the command that the event is about, chosen by its writer; 0: none.
-        by: The client that caused the event: ``grpc``, ``mqtt``, or a program such as ``program
-            1``. Empty if no client caused the event, or if the client is unknown.
+        by: The client that caused the event, as the audit log names it, such as ``web: anonymous
+            (127.0.0.1)`` or ``local: uid 1000 (pid 4711 python3)``. A local program states this
+            itself. If it has not: ``grpc``, ``mqtt``, or a program such as ``program 1``. Empty if
+            no client caused the event, or if the client is unknown.
         direction: ``in`` if the event is about data for the device, ``out`` if it is about data for
             consumers. Empty if it is about no registers, or if the direction is unknown.
         paths: The registers, elements, slices or bits that the event is about, at most 2048. If a
@@ -116,5 +118,5 @@ class Event(msgspec.Struct, frozen=True):
         """The program that caused the event, as messages name it; on the instance's host, by its pid."""
         if self.by == "fabric":
             return "a program of another cell, which shmio-supervisor audit names"
-        pid = pid_of(self.command) if self.by.startswith("program ") else 0
+        pid = pid_of(self.command) if self.by.startswith(("program ", "local: ")) else 0
         return f"pid {pid}" if pid else self.by

@@ -660,8 +660,9 @@ class BlockWriter:
         """
         with self._lock:
             at = at or self._present()
+            payload, text = record.pack()
             number = self._event = self._events.publish(
-                record.pack(),
+                payload,
                 None,
                 self.cycle,
                 at.publish_ns,
@@ -671,7 +672,7 @@ class BlockWriter:
                 Provenance.LIVE,
                 self._frames.head(),
                 0,
-                cut(record.text, REASON_SIZE),
+                text,
             )
             self._frames.wake()
             return number

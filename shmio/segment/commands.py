@@ -22,11 +22,11 @@ from shmio.layout.values.write import Write, bits_of, merge, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.model.values import PID_SHIFT
 from shmio.segment import _atomics
-from shmio.segment.events import DONE, ENDS, Event, EventKind
+from shmio.segment.events import DONE, ENDS, MAX_BY_BYTES, Event, EventKind, sender_text
 
 WRITERS: Final = 8
 """Number of command queues of a block; ``processes.py`` assigns each queue to a writer."""
-_MIN_CAPACITY: Final = 1 << 14
+_MIN_CAPACITY: Final = 1 << 15
 MAX_WRITES: Final = 4096
 """Maximum number of items in a command."""
 
@@ -37,6 +37,7 @@ MAX_NAME_BYTES: Final = 256
 
 _COMMAND: Final = struct.Struct("<QIIqBBHiQ")
 _WRITE: Final = struct.Struct("<IIB7x")
+_BY: Final = struct.Struct("<I4x")
 _KEEP: Final = 2  # flag in the byte of the direction
 
 
@@ -116,6 +117,7 @@ class Command(msgspec.Struct, frozen=True):
         keep: With INJECT: whether the injection stays when the program that created it ends.
         name: With INJECT: the name of the injection. With NOTE: the note. At most MAX_NAME_BYTES in
             UTF-8.
+        by: Who sends the command, such as ``web: anonymous (127.0.0.1)``; empty: not known.
     """
 
     writer: int
@@ -129,6 +131,7 @@ class Command(msgspec.Struct, frozen=True):
     priority: int = 0
     keep: bool = False
     name: str = ""
+    by: str = ""
 
     def pack(self) -> bytes:
         """Encode the command as a record of a queue."""
@@ -144,6 +147,8 @@ class Command(msgspec.Struct, frozen=True):
         ]  # fmt: skip
         for write in self.writes:
             parts += (_WRITE.pack(write.offset, len(write.data), write.mask), write.data, bytes(-len(write.data) % 8))
+        if by := sender_text(self.by).encode():
+            parts += (_BY.pack(len(by)), by, bytes(-len(by) % 8))
         return b"".join(parts)
 
     @classmethod
@@ -165,11 +170,14 @@ class Command(msgspec.Struct, frozen=True):
                     raise ValueError(f"an item has an invalid size ({size} bytes) or mask ({mask})")
                 writes.append(Write(offset, mask, record[at : at + size]))
                 at += size + -size % 8
+            by_size = _BY.unpack_from(record, at)[0] if at + _BY.size <= len(record) else 0
+            by = record[at + _BY.size :][: min(by_size, MAX_BY_BYTES)]
         except struct.error as error:
             raise ValueError(str(error)) from None
         return cls(
             writer, number, incarnation, deadline_ns, tuple(writes), CommandKind(kind), injection,
             Direction(flags & Direction.IN), priority, bool(flags & _KEEP), name.decode("utf-8", "replace"),
+            sender_text(by.decode("utf-8", "replace")),
         )  # fmt: skip
 
 

@@ -12,6 +12,9 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmio.model.values import NO_WRITER, Quality
+from shmio.segment._atomics import REASON_SIZE
+from shmio.segment.header import cut
+from shmio.wording import printable
 
 if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
 EVENT_DATA_SIZE: Final = 256
 """Maximum number of data bytes in an event; a longer write becomes several consecutive events."""
 EVENT_SLOTS: Final = 2048
+MAX_BY_BYTES: Final = 120
+"""Maximum number of bytes of the text that says who sent a command."""
 
 _RECORD: Final = struct.Struct("<HHIQIIBxHIQ")
 EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
@@ -98,6 +103,9 @@ ENDS: Final = frozenset(
 """Kinds of events that give the outcome of an item; REJECTED gives the outcome of a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
 """Those kinds in :data:`ENDS` that are successes: the device, consumers or an injection got the value."""
+_WITH_DATA: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.INJECTED, EventKind.SHADOWED})
+_WITHOUT_DATA: Final = ENDS - _WITH_DATA
+_SEPARATOR: Final = "\x1f"
 
 
 class Event(NamedTuple):
@@ -127,6 +135,8 @@ class Event(NamedTuple):
         data: The written bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only.
         text: A reason, the note, or the name of the injection, depending on the kind.
         injection: Number of the injection that the event is about; 0: none.
+        by: Who sent the command, such as ``web: anonymous (127.0.0.1)``; empty if no command caused
+            the event, or if its sender has not said it.
     """
 
     number: int
@@ -148,6 +158,7 @@ class Event(NamedTuple):
     data: bytes
     text: str
     injection: int = 0
+    by: str = ""
 
     @property
     def command_key(self) -> tuple[int, int, int]:
@@ -169,12 +180,44 @@ class Record(NamedTuple):
     size: int = 0
     data: bytes = b""
     injection: int = 0
+    by: str = ""
 
-    def pack(self) -> bytes:
-        """Encode the record as the payload of an event, EVENT_SIZE bytes."""
-        what = (self.kind, len(self.data), self.writer, self.command)
+    def pack(self) -> tuple[bytes, bytes]:
+        """Encode the record as the payload of an event, EVENT_SIZE bytes, and the event's text."""
+        data, text = with_sender(self.kind, self.data, self.text, self.by)
+        what = (self.kind, len(data), self.writer, self.command)
         packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size, self.injection)
-        return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
+        return packed + data.ljust(EVENT_DATA_SIZE, b"\0"), cut(text, REASON_SIZE)
+
+
+def sender_text(by: str) -> str:
+    """Return the text that says who sent a command, as events have it: one line, at most MAX_BY_BYTES in UTF-8."""
+    return cut(printable(by), MAX_BY_BYTES).decode()
+
+
+def with_sender(kind: int, data: bytes, text: str, by: str) -> tuple[bytes, str]:
+    """Return an event's data and text, with the sender of the command put into one of them.
+
+    Readers of earlier versions ignore the data of most kinds. Kinds with data of their own have the sender
+    in the text, as far as it fits.
+    """
+    if kind in _WITHOUT_DATA:
+        return (sender_text(by).encode() or data), text
+    if kind in _WITH_DATA and (by or _SEPARATOR in text):  # always, so that no name looks like a sender
+        text = cut(text, REASON_SIZE - 1).decode()
+        room = max(0, REASON_SIZE - 1 - len(text.encode()))
+        return data, f"{text}{_SEPARATOR}{cut(sender_text(by), room).decode()}"
+    return data, text
+
+
+def without_sender(kind: int, data: bytes, text: str) -> tuple[bytes, str, str]:
+    """Return what :func:`with_sender` has put together: an event's data, its text, and the sender."""
+    if kind in _WITHOUT_DATA:
+        return b"", text, sender_text(data.decode("utf-8", "replace"))
+    if kind in _WITH_DATA and _SEPARATOR in text:
+        text, _, by = text.rpartition(_SEPARATOR)
+        return data, text, sender_text(by)
+    return data, text, ""
 
 
 def decode_event(fields: FrameTuple) -> Event:
@@ -182,8 +225,9 @@ def decode_event(fields: FrameTuple) -> Event:
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
+    data, text, by = without_sender(kind, data, text)
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
-        writer, command, item, items, offset, mask, size, data, text, injection,
+        writer, command, item, items, offset, mask, size, data, text, injection, by,
     )  # fmt: skip

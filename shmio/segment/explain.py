@@ -74,8 +74,9 @@ class Explained(NamedTuple):
         places: The registers that the event concerns.
         direction: ``in``: data for the device; ``out``: data for consumers; empty: unknown or
             neither.
-        by: The client that caused the event, such as ``grpc``, ``mqtt`` or ``program 1``; empty: no
-            client caused it, or the client is unknown.
+        by: The client that caused the event, such as ``web: anonymous (127.0.0.1)``. If the event does
+            not say who it was: the owner of the command queue, such as ``grpc``, ``mqtt`` or
+            ``program 1``. Empty: no client caused it, or the client is unknown.
         definition: Definition of a new injection. If the definition takes several events, only the
             last of them has it.
         partial: True if the event has a part of a definition, and events with further parts follow.
@@ -91,6 +92,7 @@ class Explained(NamedTuple):
 class _Injection(NamedTuple):
     direction: str
     places: tuple[Place, ...]
+    by: str = ""
 
 
 class Explainer:
@@ -164,7 +166,8 @@ class Explainer:
             self._injections.pop(event.injection, None)
             self._documents.pop(event.injection, None)
         partial = event.kind == EventKind.INJECTED and definition is None and len(event.data) == EVENT_DATA_SIZE
-        return Explained(places, direction, by(event.writer), definition, partial)
+        who = event.by or (known.by if known is not None and event.command == event.injection else "")
+        return Explained(places, direction, who or by(event.writer), definition, partial)
 
     def _of_command(self, event: Event) -> tuple[Place, ...]:
         """Return the registers that the event's items write.
@@ -240,13 +243,13 @@ class Explainer:
             self._injections.pop(next(iter(self._injections)))
         if "ranges" in definition:
             self._injections[event.injection] = _Injection(
-                str(definition.get("direction", "")), self._over(definition.pop("ranges"))
+                str(definition.get("direction", "")), self._over(definition.pop("ranges")), event.by
             )
         else:
             target = definition.get("target", "")
             targets = [str(one) for one in target] if isinstance(target, list) else [str(target)]
             inward = any(one.endswith("/in") for one in targets)
-            self._injections[event.injection] = _Injection("in" if inward else "out", ())
+            self._injections[event.injection] = _Injection("in" if inward else "out", (), event.by)
         return definition
 
     def _over(self, ranges: object) -> tuple[Place, ...]:

@@ -9,6 +9,7 @@ others always notice its death.
 from __future__ import annotations
 
 import struct
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -103,6 +104,11 @@ class Supervised(msgspec.Struct, frozen=True):
     restarts: int = 0
     spawned_ns: int = 0
     note: str = ""
+
+
+def program_name() -> str:
+    """Return the name of this program, as the process table and the audit log have it."""
+    return sys.argv[0].rpartition("/")[2] if sys.argv else ""  # not the arguments, which may be secret
 
 
 class Report(msgspec.Struct, frozen=True):

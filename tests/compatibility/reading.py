@@ -49,6 +49,8 @@ def _column(values: Any) -> Any:
 
 
 def _event(event: Any) -> list[Any]:
+    if getattr(event, "by", None) == "":  # versions before the sender have no such field
+        event = event[:-1]
     return [value.hex() if isinstance(value, bytes) else value for value in event]
 
 

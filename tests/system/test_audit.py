@@ -60,6 +60,9 @@ sha256 = "{secret(PASSWORD)}"
 
 [web]
 listen = "{{web}}"
+
+[recorder]
+directory = "dumps"
 """
 
 
@@ -226,6 +229,24 @@ def test_each_way_to_change_something_has_its_entry(cell: Cell, addresses: dict[
     assert "token tester" in cell.output("shmio-supervisor", "audit")
     cell.down()
     assert [one["action"] for one in printed(cell, "-n", "2")] == ["down", "stopped"]
+    check_recorded_senders(cell)
+
+
+def check_recorded_senders(cell: Cell) -> None:
+    """Each command in the recording has the sender that its entry of the audit log names."""
+    lines = cell.output(
+        "shmio-dump", "cat", "--json", *map(str, sorted((cell.folder / "dumps").iterdir()))
+    ).splitlines()
+    events = [event for line in lines if "event" in (event := json.loads(line)) and event["command"]]
+    senders = {
+        entry["command"]: f"{entry['endpoint']}: {entry['kind']} {entry['who']}".rstrip() + f" ({entry['from']})"
+        for entry in printed(cell, "-n", "1000")
+        if entry["command"]
+    }
+    assert {event["by"] for event in events if event["command"] in senders} == set(senders.values())
+    assert {sender.partition(":")[0] for sender in senders.values()} == {"grpc", "local", "mqtt", "opcua"}
+    assert "web: token tester (127.0.0.1)" in {event["by"] for event in events}
+    assert [event for event in events if senders.get(event["command"], event["by"]) != event["by"]] == []
 
 
 @pytest.mark.timeout(600)

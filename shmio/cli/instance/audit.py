@@ -13,7 +13,7 @@ import msgspec
 
 from shmio import control
 from shmio.audit.reading import EntryFilter, entries, parse_entry, present_files
-from shmio.audit.trail import Entry
+from shmio.audit.trail import Entry, words_of
 from shmio.cli.common import dumps
 from shmio.cli.target import target
 from shmio.config import load
@@ -75,14 +75,13 @@ def _print(found: Iterable[Entry], *, as_json: bool) -> None:
 
 def line_of(entry: Entry) -> str:
     """Return an entry as a line of text."""
-    who = f"{entry.kind} {entry.who}".rstrip()
-    origin = f" ({entry.origin})" if entry.origin else ""
+    who = words_of(entry.endpoint, entry.kind, entry.who, entry.origin)
     what = ", ".join(_shown(key, value) for key, value in entry.what.items()) if isinstance(entry.what, dict) else ""
     more = f" and {entry.left_out} more" if entry.left_out else ""
     reason = f": {entry.reason}" if entry.reason else ""
     about = f" {what}{more}" if what else ""
     action = entry.action if entry.count == 1 else f"{entry.count} times {entry.action}"
-    return f"{entry.time} {entry.endpoint}: {who}{origin}: {action}{about}: {entry.outcome}{reason}"
+    return f"{entry.time} {who}: {action}{about}: {entry.outcome}{reason}"
 
 
 def _shown(key: str, value: Any) -> str:

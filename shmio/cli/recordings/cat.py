@@ -331,7 +331,7 @@ class Table:
         if where := _where(event, explained, self._room):
             what += f" {where}"
         if explained.by:
-            what += f" by {explained.by}"
+            what += f" by {printable(explained.by)}"
         if event.command and event.kind != EventKind.NOTED:
             what += f", command {event.command}.{event.item}"
         text = f": {printable(event.text)}" if event.text else ""

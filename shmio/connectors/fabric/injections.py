@@ -408,6 +408,12 @@ class MirroredInjections:
                 self._hold(sent)
             return sent.command.writer
 
+    def sender_of(self, event: Event) -> str:
+        """Return who sent the command of an event, if it came through this instance; otherwise empty."""
+        with self._lock:
+            sent = self._sent.get(event.command)
+        return "" if sent is None else sent.command.by
+
     def _hold(self, sent: _Sent) -> None:
         """Renew an injection from now on. The caller holds the lock."""
         if sent.owner is not None and sent.command.id not in self._held:
@@ -527,7 +533,7 @@ class MirroredInjections:
                 continue  # an event had it
             kind = EventKind[outcome.upper()]
             injection = command.id if kind is EventKind.INJECTED else command.injection
-            record = Record(kind, reason, command.writer, command.id, item, 1, injection=injection)
+            record = Record(kind, reason, command.writer, command.id, item, 1, injection=injection, by=command.by)
             if command.kind is CommandKind.SHADOW:
                 offset, mask, data = command.writes[item]
                 record = record._replace(offset=offset, mask=mask, size=len(data))

@@ -388,9 +388,10 @@ class MirrorLoop:
             text = f"{owner}: {text}"
         elif event.kind == EventKind.LIFTED and writer == NO_WRITER and text == LIFTED:
             text = f"lifted in {owner}"
+        by = self._injections.sender_of(event) if writer != NO_WRITER else event.by and f"{owner}: {event.by}"
         record = Record(
             cast(EventKind, event.kind), text, writer, event.command, event.item,
-            min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection,
+            min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection, by,
         )  # fmt: skip
         self._writer.event(record, quality=event.quality)
 

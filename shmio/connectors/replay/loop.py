@@ -234,7 +234,7 @@ class Player:
         record = Record(
             cast(EventKind, event.kind),  # or a number that this version does not know
             event.text, NO_WRITER, event.command, event.item, min(event.items, MAX_WRITES), event.offset, event.mask,
-            event.size, event.data, event.injection,
+            event.size, event.data, event.injection, event.by,
         )  # fmt: skip
         self._writer.cycle = event.cycle
         self._writer.event(record, quality=event.quality, at=msgspec.structs.replace(at, utc_ns=event.utc_ns))

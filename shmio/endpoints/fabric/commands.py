@@ -374,10 +374,11 @@ class CommandReceiver:
         try:
             if self._feeds.get(feed.block.source) is not feed:
                 raise CommandError(RETIRED)
-            if request.injection is None:
-                self.client(feed).write(_writes(request.writes), timeout_s, answer, attempt)
-            else:
-                self.client(feed).pass_on(request.injection, sender, timeout_s, answer, attempt)
+            with attempt.acting():
+                if request.injection is None:
+                    self.client(feed).write(_writes(request.writes), timeout_s, answer, attempt)
+                else:
+                    self.client(feed).pass_on(request.injection, sender, timeout_s, answer, attempt)
         except CommandError as error:
             self._refuse(request, attempt, answer, _rejected(str(error)))
 

@@ -156,7 +156,7 @@ class Feed:
         if event.kind == EventKind.INJECTED:  # its data describe the injection; the state has what is published
             return event._replace(data=b"", size=0)
         shown = not event.size or self.covers([(event.offset, event.size, event.mask or 0xFF)])
-        return event if shown else event._replace(data=b"", text="")
+        return event if shown else event._replace(data=b"", text="", by="")
 
     def read(self) -> tuple[list[Batch], bool]:
         """Read new entries; return them in batches, and whether more are waiting."""

@@ -192,7 +192,7 @@ class CommandReceiver:
             reply(EventKind.REJECTED, RETAINED)
             return
         try:
-            with attempt:
+            with attempt, attempt.acting():
                 client, register = self._find(path)
                 client.check(register)  # before decoding, because no value would be accepted
                 json = self._rules.of(client.block.source, register.path).payload != "text"

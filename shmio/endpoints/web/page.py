@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from shmio.audit.trail import Attempt, acting
+from shmio.audit.trail import Attempt, act, acting
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import User
 from shmio.errors import ShmioError
@@ -283,8 +283,7 @@ class Page:
     def _attempt(self, message: _Message) -> Attempt:
         """Create a call's entry in the audit log."""
         tab, _, name = message.call.partition(".")
-        with acting(self.user.actor, "web"):
-            attempt = Attempt(_ACTIONS.get(message.call, name.replace("_", " ")), {"tab": tab})
+        attempt = Attempt(_ACTIONS.get(message.call, name.replace("_", " ")), {"tab": tab})
         arguments = msgspec.json.decode(message.arguments)
         if isinstance(arguments, dict):
             named = {str(arguments["path"]): arguments["value"]} if arguments.keys() == {"path", "value"} else arguments
@@ -293,6 +292,7 @@ class Page:
 
     async def _answer(self, text: str) -> None:
         """Carry out the call in a message, and send the answer."""
+        act(self.user.actor, "web")  # in this task, and in those that it starts
         number = 0
         try:
             try:

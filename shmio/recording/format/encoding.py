@@ -17,7 +17,7 @@ from mcap.records import Channel as ChannelRecord
 from shmio.model.values import Provenance, Quality
 from shmio.recording.format.records import stream
 from shmio.segment.block import Frame
-from shmio.segment.events import EVENT_DATA_SIZE, Event
+from shmio.segment.events import EVENT_DATA_SIZE, Event, with_sender, without_sender
 
 MAX_JSON_BYTES: Final = 4096
 MAX_CHANNELS: Final = 10_000
@@ -229,13 +229,14 @@ def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 def encode_event(event: Event) -> bytes:
     """Encode an event with all its fields."""
-    text = event.text.encode()
+    data, shown = with_sender(event.kind, event.data, event.text, event.by)
+    text = shown.encode()
     head = _EVENT.pack(
         event.number, event.frame, event.cycle, event.publish_ns, event.clock_ns, event.utc_ns, event.command,
         event.injection, event.incarnation, event.writer, event.item, event.items, event.offset, event.size,
-        event.kind, event.quality, event.mask, len(event.data), len(text),
+        event.kind, event.quality, event.mask, len(data), len(text),
     )  # fmt: skip
-    return b"".join((head, event.data, text))
+    return b"".join((head, data, text))
 
 
 def decode_event(data: bytes) -> Event:
@@ -249,11 +250,12 @@ def decode_event(data: bytes) -> Event:
     text_at = _EVENT.size + data_size
     if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE or text_size > _MAX_TEXT:
         raise ValueError("an event does not match its header")
+    own, shown, by = without_sender(kind, data[_EVENT.size : text_at], data[text_at:].decode("utf-8", "replace"))
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
         writer, command, item, items, offset, mask, size,
-        data[_EVENT.size : text_at], data[text_at:].decode("utf-8", "replace"), injection,
+        own, shown, injection, by,
     )  # fmt: skip
 
 

@@ -72,6 +72,26 @@ def test_event_has_all_its_fields(segment: Segment, cell: Attachment) -> None:
     assert (noted.kind, noted.text, noted.by, noted.paths) == (EventKind.NOTED, "here", "program 3", ())
 
 
+def test_event_says_who_caused_it(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("cell")
+    by, how = "web: anonymous (127.0.0.1)", b'{"direction":"out","ranges":[[0,2,255]]}'
+    with cell.events() as events:
+        writer.event(Record(Recorded.ACCEPTED, "", 0, 7, 0, 1, 2, 0, 2, b"\1\2", by=by))
+        writer.event(Record(Recorded.WRITTEN, "", 0, 7, 0, 1, 2, 0, 2, by=by))
+        writer.event(Record(Recorded.INJECTED, "n", 0, 9, 0, 1, 0, 0, len(how), how, 9, by))
+        writer.event(Record(Recorded.LIFTED, "the injection's client has ended", 0, 9, 0, 1, injection=9))
+        writer.event(Record(Recorded.NOTED, "here", 0, 10))
+        found = [next(events) for _ in range(5)]
+    assert [(event.by, event.text) for event in found] == [
+        (by, ""),
+        (by, ""),
+        (by, "n"),
+        (by, "the injection's client has ended"),
+        ("program 1", "here"),
+    ]
+    assert (found[0].values, found[2].paths) == ({"cell/b": 0x102}, ("cell/a",))
+
+
 def test_injection_from_before_the_stream_is_known(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     entry = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}

@@ -78,6 +78,9 @@ def described(file: Path) -> dict[str, Any]:
             }
             for message in messages
         ]
+        for message in items:
+            if message["item"].get("by") == "":  # the files are from before events had a sender
+                del message["item"]["by"]
         return {"about": reader.about, "closed": reader.records.closed, "layouts": layouts, "messages": items}
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shmio.audit.trail import Actor, acting
 from shmio.errors import CommandError
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import CommandSender
@@ -43,6 +46,9 @@ def segment(instance: str) -> Iterator[Segment]:
 def test_a_command_survives_a_round_trip(writes: list[Write], number: int, incarnation: int, deadline_ns: int) -> None:
     command = Command(3, number, incarnation, deadline_ns, tuple(writes))
     assert Command.unpack(3, command.pack()) == command
+    told = Command(3, number, incarnation, deadline_ns, tuple(writes), by="web: anonymous (127.0.0.1)")
+    assert told.pack().startswith(command.pack()), "readers of earlier versions ignore what follows the items"
+    assert Command.unpack(3, told.pack()) == told
 
 
 @given(st.binary(max_size=200))
@@ -102,7 +108,7 @@ def test_each_writer_has_a_queue_and_all_share_one_doorbell(segment: Segment) ->
 
 def test_a_full_queue_is_an_error_for_the_sender(segment: Segment) -> None:
     sender = CommandSender(segment.blocks["cell"], 2)
-    write = Write(0, 0, bytes(4000))
+    write = Write(0, 0, bytes(3800))
     for _ in range(capacity_for(2) // 4096):
         sender.submit([write], 0)
     with pytest.raises(CommandError, match="cell: its command queue is full"):
@@ -120,7 +126,25 @@ def test_a_command_names_the_process_it_is_for(segment: Segment) -> None:
     number = CommandSender(block, 1).submit([Write(0, 0, b"\0\1")], 17)
     record = block.commands.pop(1)
     assert record is not None
-    assert Command.unpack(1, record) == Command(1, number, 2, 17, (Write(0, 0, b"\0\1"),))
+    command = Command.unpack(1, record)
+    assert command == Command(1, number, 2, 17, (Write(0, 0, b"\0\1"),), by=command.by)
+    assert re.fullmatch(rf"local: uid {os.getuid()} \(pid {os.getpid()} \S.*\)", command.by)
+
+
+def test_a_command_says_who_sends_it(segment: Segment) -> None:
+    """The text comes from clients: it is bounded, and has no control characters. The right texts are written here."""
+    block = segment.blocks["cell"]
+    actors = {
+        ("anonymous", "", "127.0.0.1", "web"): "web: anonymous (127.0.0.1)",
+        ("token", "a\x1b[2J\x1f\nb", "", "grpc"): r"grpc: token a\x1b[2J\x1f\nb",
+        ("account", "ü" * 500, "", "opcua"): f"opcua: account {'ü' * 52}",  # 16 bytes, and 104 of 120
+    }
+    for (kind, name, origin, endpoint), text in actors.items():
+        with acting(Actor(kind, name, origin), endpoint):
+            CommandSender(block, 1).submit([Write(0, 0, b"\0\1")], 17)
+        assert Command.unpack(1, block.commands.pop(1) or b"").by == text
+    CommandSender(block, 4).submit([Write(0, 0, b"\0\1")], 17)
+    assert Command.unpack(4, block.commands.pop(4) or b"").by == "", "readers name the endpoint by its queue"
 
 
 @pytest.mark.parametrize("geometry", [(0, 0, 0, 0), (8, 128, 100, 0), (8, 64, 128, 0), (2000, 256, 128, 0)])

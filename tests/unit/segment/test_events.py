@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, BlockWriter, EventKind, ProcessSpec, Quality, Record, Segment
-from shmio.segment.events import EVENT_DATA_SIZE, EVENT_SIZE, EVENT_SLOTS, decode_event
+from shmio.segment.events import ENDS, EVENT_DATA_SIZE, EVENT_SIZE, EVENT_SLOTS, decode_event
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
 
@@ -37,14 +37,35 @@ def test_an_event_survives_a_round_trip(writer: BlockWriter) -> None:
     writer.publish(b"\0\1", cycle=6)
     writer.cycle = 7
     data = bytes(range(200))
-    number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data, 77))
+    number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data, 77, "web: Jürgen"))
     event = writer.block.events.read(number)
     assert event is not None
     assert (event.number, event.frame, event.cycle, event.quality) == (2, 1, 7, Quality.GOOD)
-    assert event[9:] == (4, 99, 3, 1, 12, 0, 200, data, "grün", 77)
+    assert event[9:] == (4, 99, 3, 1, 12, 0, 200, data, "grün", 77, "web: Jürgen")
     frame = writer.block.latest()
     assert frame is not None
     assert event.publish_ns - event.clock_ns == frame.publish_ns - frame.clock_ns
+
+
+def test_an_event_says_who_sent_the_command(writer: BlockWriter) -> None:
+    by = "web: anonymous (127.0.0.1)"
+    full = b"\1" * EVENT_DATA_SIZE
+    for kind in EventKind:
+        data = full if kind in (EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.INJECTED, EventKind.SHADOWED) else b""
+        if not data and kind not in ENDS:
+            continue
+        event = writer.block.events.read(writer.event(Record(kind, "text", 0, 99, data=data, by=by)))
+        assert event is not None
+        assert (event.kind, event.text, event.data, event.by) == (kind, "text", data, by)
+    long = "x" * 256
+    for kind, shown in ((EventKind.NOTED, by), (EventKind.REJECTED, by), (EventKind.SHADOWED, "")):
+        event = writer.block.events.read(writer.event(Record(kind, long, 0, 99, by=by)))
+        assert event is not None
+        assert (event.text[:255], event.by) == (long[:255], shown), "the text comes first"
+    for by in ("", "local: uid 1"):
+        event = writer.block.events.read(writer.event(Record(EventKind.SHADOWED, "name\x1fgrpc: token admin", by=by)))
+        assert event is not None
+        assert (event.text, event.by) == ("name\x1fgrpc: token admin", by), "the name of an injection is no sender"
 
 
 def test_frames_and_events_refer_to_each_other(writer: BlockWriter) -> None:

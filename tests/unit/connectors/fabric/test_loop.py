@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
@@ -286,18 +287,14 @@ def test_a_bad_frame_of_the_mirror_takes_no_cycle_of_a_frame_that_comes_late(mir
 
 def test_events_of_the_owner_have_no_writer(mirroring: Mirroring) -> None:
     written = Event(
-        4, EventKind.WRITTEN, 7, 1007, 0, 0, 9, 3, Quality.GOOD, 5, 99, 1, 2, 0, 0, 2, b"\0\5", "by the owner"
-    )
+        4, EventKind.WRITTEN, 7, 1007, 0, 0, 9, 3, Quality.GOOD, 5, 99, 1, 2, 0, 0, 2, b"", "by the owner",
+        by="web: anonymous (127.0.0.1)",
+    )  # fmt: skip
     quality = written._replace(kind=EventKind.QUALITY, number=5)
     mirroring.send(frame(7, 1), quality, written)
     event = mirroring.event(EventKind.WRITTEN)
-    assert (event.writer, event.command, event.text, event.data, event.cycle) == (
-        NO_WRITER,
-        99,
-        "by the owner",
-        b"\0\5",
-        1007,
-    )
+    assert (event.writer, event.command, event.text, event.cycle) == (NO_WRITER, 99, "by the owner", 1007)
+    assert re.fullmatch(r"cell \S+( on host \S+)?: web: anonymous \(127\.0\.0\.1\)", event.by)
 
 
 def test_another_layout_makes_the_source_bad_and_asks_for_a_reload_once(mirroring: Mirroring) -> None:
