@@ -145,6 +145,8 @@ class Examined(NamedTuple):
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
     """For each faulty source, by index: connector, its keys in the section, and its keys in the properties file."""
+    names: list[str] | None
+    """The names of all sources of the file, also of faulty ones; None if one of them has none or a wrong one."""
 
 
 def examine(file: Path, text: str | None = None) -> Examined:
@@ -302,11 +304,12 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     for source in config.source:
         if source.tags is not None:
             source.layout, source.tags = [*_files(source.layout), *_files(source.tags)], None
-    for fault in _name_faults(config):
+    misnamed = [*_name_faults(config)]
+    for fault in misnamed:
         faults.add(fault)
-    if not faults:  # otherwise, a reference may be to a section that was left out
-        for fault in _reference_faults(config):
-            faults.add(fault)
+    names = _names(tables.get("source", [])) if not misnamed else None
+    for fault in _reference_faults(config, names) if names is not None else ():
+        faults.add(fault)
     for fault in (*_time_faults(config), *_rotation_faults(config), *declaration_faults(config.injection)):
         faults.add(fault)
     for fault in alert_faults(config):
@@ -332,7 +335,14 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     resolve_web(config)
     for alert in config.alert:
         resolve_alert(alert, config)
-    return Examined(config, faults, broken)
+    return Examined(config, faults, broken, names)
+
+
+def _names(sources: Any) -> list[str] | None:
+    """Return the names of all sources; None if one of them has none, so that a reference may be to that source."""
+    names = [one.get("name") if isinstance(one, dict) else None for one in sources] if isinstance(sources, list) else []
+    found = [name for name in names if isinstance(name, str)]
+    return found if len(found) == len(names) and isinstance(sources, list) else None
 
 
 def _files(names: str | list[str] | None) -> list[str]:
@@ -602,8 +612,7 @@ def _name_faults(config: Config) -> Iterator[str]:
             seen[folded] = f"{table}[{index}]"
 
 
-def _reference_faults(config: Config) -> Iterator[str]:
-    names = [source.name for source in config.source]
+def _reference_faults(config: Config, names: Sequence[str]) -> Iterator[str]:
     for name in config.recorder.sources if config.recorder else ():
         if name not in names:
             yield f"recorder.sources: {unknown('source', name, names)}"

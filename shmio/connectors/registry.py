@@ -112,11 +112,18 @@ _MEANT: Final = {
 
 def _unknown(name: str) -> str:
     """Return the message about a connector that does not exist, with the one that is meant, if that is clear."""
+    found = meant_by(name)
+    return f"unknown connector {brief(name)}; {did_you_mean([found])}" if found else unknown("connector", name, names())
+
+
+def meant_by(name: str) -> str:
+    """Return the connector that is probably meant by a name; "" if that is not clear."""
     known = names()
+    if name in known:
+        return name
     folded = "".join(char for char in name.lower() if char.isalnum())
     meant = {one: one for one in known} | _MEANT
-    found = next((meant[begin] for begin in sorted(meant, key=len, reverse=True) if folded.startswith(begin)), "")
-    return f"unknown connector {brief(name)}; {did_you_mean([found])}" if found else unknown("connector", name, known)
+    return next((meant[begin] for begin in sorted(meant, key=len, reverse=True) if folded.startswith(begin)), "")
 
 
 def load(name: str) -> type[Connector] | type[Computed] | type[Replayed] | type[Mirrored]:

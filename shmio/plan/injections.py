@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
 from shmio.config import Config, Declaration, Source
+from shmio.config.faults import Faults
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
 from shmio.connectors.injection_layers import MAX_INJECTIONS
@@ -21,17 +22,19 @@ from shmio.segment import Provenance
 from shmio.segment.injection_list import InjectionEntry, declared_document, encode, ranges_of
 
 
-def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
+def check_injections(
+    config: Config, layouts: Mapping[str, Layout], faults: Faults, is_unsure: Callable[[str], bool]
+) -> tuple[dict[str, bytes], tuple[str, ...]]:
     """Return the encoded injections for each source's process, by source name, and a line about each injection.
 
-    Raises:
-        ConfigError: An injection is invalid; the message begins with the full key.
-
+    Faults are added to ``faults``. ``is_unsure`` returns whether a text may name a source whose registers are unknown.
     """
     periods_ns = {source.name: source.period_ns for source in config.source}
     found: dict[str, list[Program]] = {}
     described = []
     for index, declaration in enumerate(config.injection):
+        if is_unsure(f"{declaration.target} {declaration.when}"):
+            continue
         try:
             if not config.source:
                 raise ConfigError("target: the configuration has no [[source]]")
@@ -46,11 +49,16 @@ def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dic
             if program.direction == "in":
                 _check_in(program, source, layouts[source.name])
         except ConfigError as error:
-            raise ConfigError(f"injection[{index}].{error}") from None
+            faults.add(f"injection[{index}].{error}")
+            continue
         found.setdefault(program.source, []).append(program)
         over = f"{declaration.operation} over source {program.source} /{program.direction}"
         described.append(f"injection {declaration.name}: {over}")
-    return {source: _document(source, programs) for source, programs in found.items()}, tuple(described)
+    documents: dict[str, bytes] = {}
+    for name, programs in found.items():
+        with faults.catching():
+            documents[name] = _document(name, programs)
+    return documents, tuple(described)
 
 
 def _check_in(program: Program, source: Source, layout: Layout) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,14 +24,11 @@ _ANY: Final = "0" * 32
 _LISTEN: Final = "0A"
 
 
-def check_listening(config: Config) -> None:
+def check_listening(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
     """Check that host names can be resolved, and that no two addresses have the same port.
 
-    Addresses with port 0 never conflict, because port 0 stands for any free port.
-
-    Raises:
-        ConfigError: A host name cannot be resolved, or two addresses share a port.
-
+    Addresses with port 0 never conflict, because port 0 stands for any free port. Malformed addresses are skipped,
+    because they are reported before. ``catching`` returns a context manager that collects a ConfigError.
     """
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
     if config.grpc:
@@ -49,20 +46,38 @@ def check_listening(config: Config) -> None:
     seen: list[tuple[str, str, int, set[str]]] = []
     sockets: dict[UnixAddress, str] = {}
     for key, text in listening:
-        address = parse_address(text)
-        if isinstance(address, UnixAddress):
-            if address in sockets:
-                raise ConfigError(f"{key}: {sockets[address]} has the same socket, {text}; choose another path")
-            sockets[address] = key
-            continue
-        try:
-            hosts = _hosts(address)
-        except ConfigError as error:
-            raise ConfigError(f"{key}: {error}") from None
-        for other, seen_text, port, others in seen:
-            if port == address.port != 0 and _share(hosts, others):
-                raise ConfigError(f"{key}: {text} has the same port as {other} ({seen_text}); choose another port")
-        seen.append((key, text, address.port, hosts))
+        with suppress(ConfigError):
+            address = parse_address(text)
+            with catching():
+                _compare(key, text, address, seen, sockets)
+
+
+def _compare(
+    key: str,
+    text: str,
+    address: Address | UnixAddress,
+    seen: list[tuple[str, str, int, set[str]]],
+    sockets: dict[UnixAddress, str],
+) -> None:
+    """Compare an address with those ``seen`` and with ``sockets``, and add it to them.
+
+    Raises:
+        ConfigError: Its host name cannot be resolved, or it shares a port or a path.
+
+    """
+    if isinstance(address, UnixAddress):
+        if address in sockets:
+            raise ConfigError(f"{key}: {sockets[address]} has the same socket, {text}; choose another path")
+        sockets[address] = key
+        return
+    try:
+        hosts = _hosts(address)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    for other, seen_text, port, others in seen:
+        if port == address.port != 0 and _share(hosts, others):
+            raise ConfigError(f"{key}: {text} has the same port as {other} ({seen_text}); choose another port")
+    seen.append((key, text, address.port, hosts))
 
 
 def check_ports(plan: Plan) -> None:

@@ -29,7 +29,8 @@ from shmio.layout.glob import Glob
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import Layout
 from shmio.layout.spelling import block_path, topic_path
-from shmio.layout.topic import find, look_up, names_part, near, parse_topic
+from shmio.layout.topic import find, look_up, names_part, parse_topic
+from shmio.layout.topic import near as near_paths
 from shmio.layout.values.write import chosen
 from shmio.plan.host import check_host, exposure
 from shmio.plan.layouts import LayoutFiles
@@ -38,7 +39,7 @@ from shmio.plan.processes import ALERTS, Plan, make_plan, process_names
 from shmio.plan.replay import Recordings, replayed
 from shmio.plan.scene import check_scene
 from shmio.plan.sources import check_sources, describe, note_options
-from shmio.wording import did_you_mean, unknown
+from shmio.wording import did_you_mean, near, unknown
 
 DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order", "framing")
 """Keys of a source that say how its device names or stores values."""
@@ -80,7 +81,8 @@ def prepare(
         LayoutError: A layout cannot be compiled.
 
     """
-    config, faults, broken = examine(file)
+    config, faults, broken, names = examine(file)
+    sound = not faults  # otherwise, sections may have been left out, and what follows must not miss them
     origin, notices = None, list[str]()
     if mode == "log" and config.recorder is None and not faults:
         raise ConfigError(
@@ -97,54 +99,70 @@ def prepare(
             faults.play([source.name for source in config.source])
         files = LayoutFiles(config)
         notices += check_host(config, faults.catching, writes_files=writes_files)
-        if not faults:
-            with faults.catching():
-                check_listening(config)
-        sources = check_sources(config, files, recordings, faults)
+        check_listening(config, faults.catching)
+        known = [source.name for source in config.source]
+        all_sources = mode == "replay" or names == known
+        before = faults.count
+        sources = check_sources(config, files, recordings, faults, all_sources=all_sources)
     places, faults.places = faults.places, {}
     for index, own in broken.items():
         note_options(index, *own, faults)
     faults.places = places
+    unsure_sources = faults.count > before
     emulated: dict[str, tuple[Served, ...]] = {}
     for index, emulator in enumerate(config.emulator):
         with faults.catching():
-            if emulator.layout is not None or not faults:  # else it is not known which sources read it
+            if emulator.layout is not None or (all_sources and not unsure_sources):  # else its readers are unknown
                 emulated[emulator.name] = _check_emulator(index, emulator, config, files)
     layouts = sources.layouts
-    if faults:
-        _warn_besides(config, layouts, faults)
-        if any(source.name not in layouts for source in config.source):
-            faults.raise_any()  # what follows needs the registers of all sources
-    with faults.catching():
-        config = _spelled(config, layouts)
+    named = known if all_sources else names
+    missing = {name for name in named or () if name not in layouts or (named or []).count(name) > 1}
+    whole = all_sources and not missing
+
+    def is_unsure(text: str) -> bool:
+        """Return whether a text may name a source whose registers are unknown because of another fault."""
+        if whole:
+            return False
+        unclear = named is None or (missing and not layouts) or '"' in text  # TIA Portal's spelling needs all sources
+        return bool(unclear) or any(name in text for name in missing)
+
+    if whole:
+        before = faults.count
+        with faults.catching():
+            config = _spelled(config, layouts)
+        whole = faults.count == before
     declared, described = dict[str, bytes](), tuple[str, ...]()
     if config.injection:
         from shmio.plan.injections import check_injections  # noqa: PLC0415  loads numpy
 
-        with faults.catching():
-            declared, described = check_injections(config, layouts)
-    scene = check_scene(config, layouts, faults, replayed=mode == "replay")
-    if config.recorder and config.recorder.trigger:
+        declared, described = check_injections(config, layouts, faults, is_unsure)
+    scene = check_scene(config, layouts, faults, replayed=mode == "replay", is_unsure=is_unsure)
+    if config.recorder and config.recorder.trigger and not is_unsure(config.recorder.trigger.when):
         with faults.catching():
             _check_trigger(config.recorder.trigger.when, layouts)
     for index, alert in enumerate(
         config.alert if mode != "replay" else ()
     ):  # a replay has other sources, and no alerts
         with faults.catching():
-            _check_alert(f"alert[{index}]", alert, config, layouts)
-    faults.raise_any()
-    odd = [*notices, *files.odd]
-    for found in (
-        lambda: _odd(config, layouts, faults),
-        lambda: _odd_topics(config, layouts),
-        lambda: _odd_recorder(config, layouts),
-        lambda: _odd_rules(config, layouts),
-        lambda: _not_served(config, layouts, emulated),
-        lambda: _not_emulated(config),
-        lambda: _unread(emulated),
+            if not is_unsure(f"{alert.when} {alert.sources}") and (sound or not alert.processes):
+                _check_alert(f"alert[{index}]", alert, config, layouts)
+    odd = [*notices, *files.odd] if not faults else []
+    for needs, found in (
+        (whole and sound, lambda: _odd(config, layouts, faults)),
+        (not (whole and sound), lambda: _odd_besides(config, layouts, faults)),
+        (whole, lambda: _odd_topics(config, layouts)),
+        (whole, lambda: _odd_recorder(config, layouts)),
+        (whole, lambda: _odd_rules(config, layouts)),
+        (whole and sound and not unsure_sources, lambda: _not_served(config, layouts, emulated)),
+        (sound and not unsure_sources, lambda: _not_emulated(config)),
+        (True, lambda: _unread(emulated)),
     ):
-        with faults.catching():
-            odd += found()
+        if needs:
+            with faults.catching():
+                odd += found()
+    if faults:
+        for text in odd:
+            faults.warn(text)
     faults.raise_any()
     warnings = [*files.warnings, *map(faults.warning, odd)]
     plan = make_plan(
@@ -203,15 +221,14 @@ def _spelled_source(source: Source, layout: Layout) -> Source:
     )
 
 
-def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> None:
-    """Although there are faults, add warnings about the patterns of those sources whose layout is known."""
+def _odd_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> Iterator[str]:
+    """Although there are faults, yield warnings about the patterns of those sources whose layout is known."""
     names = [source.name for source in config.source]
     for index, source in enumerate(config.source):
         if source.name in layouts and names.count(source.name) == 1:
             with faults.catching():
                 spelled = _spelled_source(source, layouts[source.name])
-                for text in _odd_patterns(f"source[{index}]", spelled, layouts[source.name], faults):
-                    faults.warn(text)
+                yield from _odd_patterns(f"source[{index}]", spelled, layouts[source.name], faults)
 
 
 def peer(source: Source) -> str:
@@ -475,10 +492,12 @@ def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
 
 
 def _near(pattern: str, layout: Layout) -> str:
-    names = _wider(pattern, [one.path for one in layout.registers]) if "*" in pattern else near(layout, pattern)
+    names = _wider(pattern, [one.path for one in layout.registers]) if "*" in pattern else near_paths(layout, pattern)
     return f"; {did_you_mean(names)}" if names else ""
 
 
+MAX_NAMES = 1_000
+"""Maximum number of names to which a part of such a pattern is compared."""
 MAX_TRIED = 32
 """Maximum number of patterns that are tried in place of one that matches nothing."""
 
@@ -492,6 +511,9 @@ def _wider(pattern: str, paths: Collection[str], *begins: str) -> list[str]:
         begins: Texts that may be missing at its begin, such as the names of sources with a slash.
     """
     parts = pattern.split("/")
+    if not set(pattern) - set("*/"):  # it says nothing but the number of levels
+        shorter = ("/".join(parts[at:]) for at in range(1, len(parts)))
+        return next(([one] for one in (*shorter, "**") if one != pattern and any(map(Glob(one).matches, paths))), [])
     tried = [
         *("/".join([*parts[:at], "**", *parts[at + 1 :]]) for at, part in enumerate(parts) if part == "*"),
         "/".join("**" if part == "*" else part for part in parts),
@@ -503,7 +525,22 @@ def _wider(pattern: str, paths: Collection[str], *begins: str) -> list[str]:
         for wider in tried[:MAX_TRIED]:
             if wider != pattern and set(wider) - set("*/") and any(map(Glob(wider).matches, paths)):
                 return [wider]
+        for similar in _respelled(parts, paths):
+            for wider in (similar, f"{similar}/*", f"{similar}/**"):
+                if any(map(Glob(wider).matches, paths)):
+                    return [wider]
     return []
+
+
+def _respelled(parts: Sequence[str], paths: Collection[str]) -> Iterator[str]:
+    """Yield the pattern with one level spelled like the names that the paths have there."""
+    for at, part in enumerate(parts):
+        begin = part.partition("*")[0]
+        lengths = range(max(len(begin) - 1, 1), len(begin) + 2)
+        levels = dict.fromkeys(names[at] for names in (path.split("/") for path in paths) if at < len(names))
+        known = [name for name in levels if begin == part] or [name[:length] for name in levels for length in lengths]
+        for name in near(begin, known[:MAX_NAMES]) if begin else ():
+            yield "/".join([*parts[:at], name + part.removeprefix(begin), *parts[at + 1 :]])
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
@@ -515,7 +552,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
         if source.connector == "s7" and layout.addressed:
             wanted = [place_name(place) for place in TableMemory(layout).needs]
         for emulator in config.emulator:
-            if not wanted or emulator.kind != S7 or not _reads(source, emulator):
+            if not wanted or emulator.kind != S7 or emulator.name not in emulated or not _reads(source, emulator):
                 continue
             served = _served(emulator, emulated[emulator.name])
             if missing := [name for name in wanted if name not in served]:

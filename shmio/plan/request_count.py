@@ -30,10 +30,15 @@ def source_requests(source: Source, layout: Layout) -> CycleRequests | None:
         made.close()
 
 
+def can_write(source: Source, layout: Layout) -> bool:
+    """Return whether the connector of a checked source can write."""
+    connector = registry.load(source.connector)
+    return not issubclass(connector, Connector) or connector.for_layout(layout).can_write
+
+
 def writable_registers(source: Source, layout: Layout) -> int:
     """Return the number of a checked source's registers that commands can write, at least in part."""
-    connector = registry.load(source.connector)
-    if not source.writable or (issubclass(connector, Connector) and not connector.for_layout(layout).can_write):
+    if not source.writable or not can_write(source, layout):
         return 0
     mask = cover(layout, source.writable)
     return sum(

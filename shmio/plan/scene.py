@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,7 +45,14 @@ class _Placed(msgspec.Struct):
     label: str
 
 
-def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *, replayed: bool) -> Any:
+def check_scene(
+    config: Config,
+    layouts: Mapping[str, Layout],
+    faults: Faults,
+    *,
+    replayed: bool,
+    is_unsure: Callable[[str], bool] = lambda _text: False,
+) -> Any:
     """Return the scene of ``[web]`` for the web page, as JSON values; None if the configuration has none.
 
     Args:
@@ -54,6 +61,7 @@ def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *
         faults: The faults of the configuration, to which those of the scene are added.
         replayed: Whether a recording replaces the sources. The recording need not have all registers:
             a body whose register is missing stands still.
+        is_unsure: Returns whether a text may name a source whose registers are unknown; it is then not checked.
 
     """
     if config.web is None or config.web.scene is None:
@@ -64,7 +72,7 @@ def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *
         faults.add(f"web.scene: {error}")
         return None
     if not own:
-        drawn = _drawn_all(scene, layouts, own, replayed=replayed)
+        drawn = _drawn_all(scene, layouts, own, is_unsure, replayed=replayed)
     faults.include(own)
     if own:
         return None
@@ -75,13 +83,16 @@ def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *
     }
 
 
-def _drawn_all(scene: Scene, layouts: Mapping[str, Layout], faults: Faults, *, replayed: bool) -> list[dict[str, Any]]:
+def _drawn_all(
+    scene: Scene, layouts: Mapping[str, Layout], faults: Faults, is_unsure: Callable[[str], bool], *, replayed: bool
+) -> list[dict[str, Any]]:
     """Return all bodies as the page draws them, parents first; ``parent`` is the parent's index, or -1."""
     placed = _expanded(scene, faults)
     ordered = [] if faults else _ordered(placed, faults)
     indices = {one.name: index for index, one in enumerate(ordered)}
     drawn = [
-        _drawn(one, layouts, faults, replayed=replayed) | {"parent": -1 if one.parent is None else indices[one.parent]}
+        _drawn(one, layouts, faults, is_unsure, replayed=replayed)
+        | {"parent": -1 if one.parent is None else indices[one.parent]}
         for one in ordered
     ]
     registers = {body["joint"]["register"] for body in drawn if body["joint"]}
@@ -165,11 +176,13 @@ def _ordered(placed: list[_Placed], faults: Faults) -> list[_Placed]:
     return list(done.values())
 
 
-def _drawn(one: _Placed, layouts: Mapping[str, Layout], faults: Faults, *, replayed: bool) -> dict[str, Any]:
+def _drawn(
+    one: _Placed, layouts: Mapping[str, Layout], faults: Faults, is_unsure: Callable[[str], bool], *, replayed: bool
+) -> dict[str, Any]:
     """Return a body as the page draws it."""
     body = one.body
     joint = None
-    if body.joint is not None:
+    if body.joint is not None and not is_unsure(body.joint.register):
         try:
             joint = _moved(body.joint, layouts)
         except PathError as error:

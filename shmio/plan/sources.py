@@ -54,18 +54,22 @@ class Sources(NamedTuple):
     """For each source that can change without a new connection: its connector's class and ``register_options``."""
 
 
-def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
+def check_sources(
+    config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults, *, all_sources: bool
+) -> Sources:
     """Check each source with its connector, and add the problems to ``faults``.
 
     The function also completes the ``options`` of each source: they then have all keys, with values
-    of the right types.
+    of the right types. ``all_sources`` says whether the configuration has all sources of the file; otherwise, a
+    connection may be to one that was left out.
     """
+    before = faults.count
     found = Sources({}, [], [], {}, {})
     inputs: dict[int, tuple[str, ...]] = {}
     for index, source in enumerate(config.source):
         with faults.catching():
             _check_source(index, source, found, inputs, config, files, recordings, faults)
-    if not faults:
+    if all_sources and faults.count == before:
         for index, paths in inputs.items():
             source, key = config.source[index], f"source[{index}]"
             with faults.catching():
@@ -167,6 +171,13 @@ def note_options(index: int, connector: str, options: dict[str, Any], texts: dic
         known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
     except ConfigError as error:
         faults.add(f"{key}.connector: {error}")
+        meant = registry.meant_by(connector)
+        if meant and meant != connector:
+            with suppress(ConfigError):
+                known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(meant))]
+                for option in (*options, *texts):
+                    if option not in known:
+                        faults.add(unknown_option(index, option, known))
         return
     near_to = {name for option in (*options, *texts) if option not in known for name in near(option, known)}
     for option in (*options, *texts):

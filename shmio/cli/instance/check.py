@@ -19,7 +19,7 @@ from shmio.plan.host import open_doors
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
-from shmio.plan.request_count import source_requests, writable_registers
+from shmio.plan.request_count import can_write, source_requests, writable_registers
 from shmio.segment import PREFIX, BlockSpec, Segment
 from shmio.supervisor.start import refuse_running
 from shmio.wording import counted, printable
@@ -158,6 +158,7 @@ class _Figures:
             "requests": [self._case(one) for one in self._requests.requests] if self._requests else [],
             "load_note": self._requests.note if self._requests else "",
             "writable": list(source.writable),
+            "can_write": can_write(source, block.layout),
             "writable_registers": writable_registers(source, block.layout),
         }
         """The keys and values that ``--json`` prints for the source."""
@@ -204,7 +205,8 @@ def _load_lines(source: dict[str, Any]) -> Iterator[str]:
         patterns = shorten(", ".join(source["writable"]), MAX_PATTERNS)
         yield f"  writable: {counted(count, 'register')}: {patterns}"
     elif source["writable"]:
-        yield "  writable: no registers, because the connector cannot write, or the patterns match nothing"
+        why = "the patterns match nothing" if source["can_write"] else "the connector cannot write"
+        yield f"  writable: no registers, because {why}"
 
 
 def _case_text(case: dict[str, Any], period_ms: float) -> str:

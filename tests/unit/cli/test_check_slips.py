@@ -72,11 +72,14 @@ def test_patterns_that_match_nothing_suggest_one_that_matches(capsys: pytest.Cap
     for pattern, meant in {
         "Rob/*/SetPos": "Rob/**/SetPos", "*/SetPos": "**/SetPos", "Axis/*/SetPos": "**/Axis/*/SetPos",
         "cell/Rob/*": "Rob/*", "Nix/*": None,
+        "*/*/*/*/*": "*/*/*/*", "Rbo/**": "Rob/**", "Robt/Axis/*/*": "Rob/Axis/*/*",
+        "Mdoe*": "Mode*", "Rob/Axs*": "Rob/Axis*",
     }.items():  # fmt: skip
         status, told = check(capsys, SOURCE.format(connector="memory", more=f'writable = ["{pattern}"]'))
         assert status == 0
         remedy = f"; did you mean '{meant}'?" if meant else "\n"
         assert f"writable: '{pattern}' matches no register of rob{remedy}" in told
+        assert "  writable: no registers, because the patterns match nothing\n" in told
     topics = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n[[mqtt.topic]]\nmatch = "Rob/**"\n'
     _, told = check(capsys, SOURCE.format(connector="memory", more=topics))
     assert "mqtt.topic[0].match: 'Rob/**' matches no register; did you mean 'cell/Rob/**'?" in told
@@ -104,6 +107,45 @@ def test_all_faults_of_all_kinds_are_shown_at_once(folder: Path, capsys: pytest.
         "scene.toml:1: joint: unknown key",
     ):
         assert fault in told
+
+
+def test_a_fault_hides_no_fault_of_another_section_and_causes_none(capsys: pytest.CaptureFixture[str]) -> None:
+    layout, scene = "source[0].layout: ", "web.scene: "
+    two = '[[source]]\nname = "two"\nconnector = "memory"\nlayout = "rob.toml"\n'
+    for old, new, more, faults in (
+        (
+            'connector = "memory"\n', 'connector = "S7-1500"\nhost = "192.168.0.300"\nperiode_ms = 20\n',
+            '[recoder]\ndirectory = "d"\n',
+            ("source[0].connector: ", "source[0].host: ", "source[0].periode_ms: unknown key; did you mean 'period_ms'",
+             "recoder: ", scene),
+        ),
+        ("period_ms", 'writable = ["Nix/*"]\nperiod_ms', "", ("warning: source[0].writable: 'Nix/*'", scene)),
+        (
+            "period_ms = 20", "period_ms = 0.01", '[grpc]\nlisten = ["127.0.0.1:8080"]\ndefault_source = "cell"\n',
+            ("source[0].period_ms: ", "web.listen: 127.0.0.1:8080 has the same port as grpc.listen[0]", scene),
+        ),
+        (
+            "rob.toml", "db202.db", '[[emulator]]\nname = "plc"\nkind = "s7"\nlisten = "127.0.0.1:1102"\n',
+            (layout, scene),
+        ),
+        (
+            "rob.toml", "db202.db", two + "".join(
+                f'[[alert]]\nname = "{source}"\nwhen = "{source}/Nix > 1"\n' for source in ("cell", "two")
+            ),
+            (layout, "alert[1].when: two/Nix: ", scene),
+        ),
+        ("rob.toml", "db202.db", two + '[recorder]\nsources = ["cell", "twoo"]\n', (layout, "'twoo'", scene)),
+        (
+            "period_ms = 20", "period_ms = 0.01",
+            '[[injection]]\nname = "i"\ntarget = "cell/Mode"\noperation = "set"\nvalue = 1\n',
+            ("source[0].period_ms: ", scene),
+        ),
+    ):  # fmt: skip
+        text = SOURCE.format(connector="memory", more="").replace(old, new, 1)
+        _, told = check(capsys, f'{text}{more}[web]\nlisten = "127.0.0.1:8080"\nscene = "none.toml"\n')
+        lines = [line for line in told.splitlines() if "supervisor.toml:" in line]
+        assert len(lines) == len(faults), told
+        assert all(any(fault in line for line in lines) for fault in faults), told
 
 
 def test_open_doors_are_named_if_others_are_guarded(capsys: pytest.CaptureFixture[str]) -> None:

@@ -557,7 +557,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     assert source == {
         "source": "cell", "peer": "127.0.0.1:1102", "block": "DB201", "registers": 22, "bytes": 2180,
         "ring_frames": 512, "period_ms": 20.0, "reads": "bytes 0 to 2179 of DB201",
-        "writable": ["Outpts", "Outputs", "Robot_*/*"], "writable_registers": 19,
+        "writable": ["Outpts", "Outputs", "Robot_*/*"], "can_write": True, "writable_registers": 19,
     }  # fmt: skip
     assert [one["requests"] for one in by_pdu_size] == [10, 5, 3]
     assert by_pdu_size[0] == {
