@@ -16,16 +16,20 @@ class LoopThread:
     """An event loop in its own thread. Start it once."""
 
     def __init__(self, name: str) -> None:
-        self._loop = asyncio.new_event_loop()
-        log_loop_errors(self._loop)
-        self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
+        self._name = name
+        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Start the thread."""
+        self._loop = asyncio.new_event_loop()  # not earlier: a check makes emulators that it does not start
+        log_loop_errors(self._loop)
+        self._thread = threading.Thread(target=self._loop.run_forever, name=self._name, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """Cancel all tasks in the loop; return when the thread has ended."""
+        if self._thread is None:
+            return
         if self._thread.is_alive():
             self.run(_cancel_others)
             self._loop.call_soon_threadsafe(self._loop.stop)

@@ -11,6 +11,7 @@ import struct
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
@@ -67,6 +68,11 @@ class _Place:
             self._words = WordCodec(address, register, *orders)
         self._starts = range(address.number, self.stop, self.width)
         self._packed = struct.Struct(f">{self.width}H")
+
+    @property
+    def swaps(self) -> tuple[bool, bool]:
+        """Whether the device has the words, and the bytes of a word, in the order that is not usual."""
+        return (False, False) if self._words is None else self._words.swaps
 
     @property
     def key(self) -> Key:
@@ -206,9 +212,10 @@ class ModbusEmulator:
         self._server: ModbusTcpServer | None = None
         self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
 
-    def _serve_tables(self, served: Sequence[Served], known: Collection[Key] = ()) -> None:
+    def _serve_tables(self, served: Sequence[Served], known: Mapping[Key, _Place] = MappingProxyType({})) -> None:
         """Serve tables, with the initial values of registers that are not ``known``."""
         images = [_TableImage(one) for one in served]
+        places = _by_key(images)
         made = program(self._program_name, served[0].layout, self._code)
         words: Words = {}
         for image in images:
@@ -218,6 +225,11 @@ class ModbusEmulator:
         for where, entries in words.items():
             before = self._words.get(where, [])[: len(entries)]
             entries[: len(before)] = before
+        for key in places.keys() & known.keys():
+            place, old = places[key], known[key]
+            if place.swaps != old.swaps:
+                with suppress(ValueError):
+                    place.write(words[place.where], old.read(self._words[old.where]))
         sizes = {where: len(entries) for where, entries in self._words.items()}
         for image in images:
             image.fill(words, known, sizes)
@@ -230,7 +242,7 @@ class ModbusEmulator:
         if _framing_of(served) != self._framing:
             raise ConfigError("framing: restart the instance to change the framing of an emulated device")
         with self._lock:
-            self._serve_tables(served, {place.key for image in self._images for place in image.places})
+            self._serve_tables(served, _by_key(self._images))
 
     def start(self) -> None:
         """Run the first cycle, listen, and continue in threads.
@@ -312,6 +324,18 @@ class ModbusEmulator:
             before = bytes(self._frame)
             self._program.step(time_s, self._frame)
             image.store(before, self._frame, self._words)
+
+
+def _by_key(images: Sequence[_TableImage]) -> dict[Key, _Place]:
+    """Return the registers of tables by their keys. Raise ConfigError if one has two orders of words or bytes."""
+    found: dict[Key, _Place] = {}
+    for place in (place for image in images for place in image.places):
+        if found.setdefault(place.key, place).swaps != place.swaps:
+            raise ConfigError(
+                f"layout: {place.register.path}: the sources that read this register of unit {place.where[0]} differ "
+                "in word_order or byte_order; give them the same, or give each its own emulator"
+            )
+    return found
 
 
 def _framing_of(served: Sequence[Served]) -> str:

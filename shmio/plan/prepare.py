@@ -281,7 +281,27 @@ def _check_emulator(index: int, emulator: Emulator, config: Config, files: Layou
         layouts = files.all(key, emulator)
     else:
         layouts = (files.get(key, emulator, emulator.dbNumber),)
-    return _check_served(key, emulator, [Served(layout) for layout in layouts], config)
+    served = [Served(layout, keys) for layout in layouts for keys in _device_keys(emulator, config)]
+    return _check_served(key, emulator, served, config)
+
+
+def _device_keys(emulator: Emulator, config: Config) -> list[dict[str, Any]]:
+    """Return the device keys of the sources that read an emulator, without repetition; an empty dict if none reads it.
+
+    A Modbus device needs each of them, because they may differ in the unit. The nodes of an OPC UA server are alike for
+    all clients, so that a source without device keys adds nothing.
+    """
+    found: list[dict[str, Any]] = []
+    for source in config.source:
+        if _reads(source, emulator) and (keys := _keys_of(source)) not in found:
+            found.append(keys)
+    if emulator.kind == "opcua":
+        found = [keys for keys in found if keys.get("nodes") == "siemens"]
+    return found or [{}]
+
+
+def _keys_of(source: Source) -> dict[str, Any]:
+    return {name: source.options[name] for name in DEVICE_KEYS if name in source.options}
 
 
 def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config: Config) -> tuple[Served, ...]:
@@ -326,7 +346,7 @@ def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles)
         number = source.options.get("dbNumber")
         layout = files.get(f"source[{index}]", source, number, optimized=emulator.kind != S7)
         if emulator.kind != S7 or layout.addressed:
-            served = Served(layout, {name: source.options[name] for name in DEVICE_KEYS if name in source.options})
+            served = Served(layout, _keys_of(source))
             if served not in tables:
                 tables.append(served)
             continue

@@ -159,7 +159,7 @@ class WordCodec:
         self._text = address.kind.base == "STRING"
         self._bytes, self._length = 2 * address.width, address.kind.length
         self._swap_bytes = (address.byte_order or byte_order) == "little"
-        self._swap_words = (address.word_order or word_order) == "little" and not self._text
+        self._swap_words = (address.word_order or word_order) == "little" and not self._text and address.width > 1
         self._scale = register.scale
         self._whole = register.element.base not in ("REAL", "LREAL")
         self._whole_there = address.kind.base not in ("REAL", "LREAL")
@@ -174,6 +174,11 @@ class WordCodec:
         self.masks: Final = struct.unpack(f">{address.width}H", self.ordered(own))
         """For each word of an element, the bits that the element takes. The rest belongs to something else."""
         self._encoding = text_encoding(register.encoding)
+
+    @property
+    def swaps(self) -> tuple[bool, bool]:
+        """Whether the device has the words, and the bytes of a word, in the order that is not usual."""
+        return self._swap_words, self._swap_bytes
 
     def decode(self, data: bytes) -> Scalar:
         """Return an element's value. ``data`` are the element's words as the device sent them."""

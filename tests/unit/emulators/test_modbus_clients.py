@@ -137,6 +137,18 @@ def test_all_sources_of_a_device_have_one_framing() -> None:
         emulator.change(served[1:])
 
 
+def test_a_register_keeps_its_value_when_the_order_of_its_words_changes() -> None:
+    layout = place_tags("plant", {"a": {"type": "DINT", "address": "holding 0", "initial": 74}})
+    emulator = ModbusEmulator([Served(layout)], "idle", Address("127.0.0.1", 1))
+    held = emulator._words[1, Table.HOLDING]
+    held[:2] = [0x0001, 0x0002]
+    emulator.change([Served(layout, {"word_order": "little"})])
+    assert emulator._words[1, Table.HOLDING][:2] == [0x0002, 0x0001]
+    with pytest.raises(ConfigError, match="layout: a: the sources that read this register of unit 1 differ"):
+        emulator.change([Served(layout), Served(layout, {"word_order": "little"})])
+    assert emulator._words[1, Table.HOLDING][:2] == [0x0002, 0x0001]
+
+
 def test_clients_that_never_send_a_request_make_room(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

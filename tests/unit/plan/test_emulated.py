@@ -124,3 +124,54 @@ def test_a_faulty_source_is_the_only_fault(folder: Path) -> None:
         prepared(folder, source("press", "press.toml", 'timeout = "long"\n'), EMULATOR)
     assert "timeout" in str(caught.value)
     assert "emulator" not in str(caught.value)
+
+
+MODBUS = SOURCE.replace('"s7"', '"modbus"')
+TABLE = """
+[registers]
+"a" = { type = "DINT", address = "holding 0", initial = 74 }
+"b" = { type = "INT", address = "holding 2" }
+"""
+
+
+def test_an_emulator_with_a_layout_of_its_own_has_the_device_keys_of_its_sources(folder: Path) -> None:
+    (folder / "plant.toml").write_text(TABLE)
+    emulator = EMULATOR.replace('"s7"', '"modbus"') + 'layout = "plant.toml"\n'
+
+    def read_by(*keys: str) -> list[dict[str, object]]:
+        sources = [
+            MODBUS.replace("NAME", f"m{at}").replace("LAYOUT", "plant.toml") + more for at, more in enumerate(keys)
+        ]
+        usual = {"unit": 1, "framing": "tcp", "word_order": "big", "byte_order": "big"}
+        found = [dict(options) for _, options in prepared(folder, *sources, emulator).emulated["plc"]]
+        return [{key: value for key, value in one.items() if value != usual[key]} for one in found]
+
+    assert read_by() == [{}]
+    assert read_by(
+        'word_order = "little"\nframing = "rtu"\n', "max_gap = 3\nframing = 'rtu'\nword_order = 'little'"
+    ) == [{"word_order": "little", "framing": "rtu"}]
+    assert read_by('byte_order = "little"\n', "unit = 7\n") == [{"byte_order": "little"}, {"unit": 7}]
+    for first, second, reason in (
+        (
+            'word_order = "little"\n',
+            "",
+            "layout: a: the sources that read this register of unit 1 differ in word_order",
+        ),
+        ('byte_order = "little"\n', "unit = 1\n", "layout: a: the sources that read this register of unit 1 differ"),
+        ('framing = "rtu"\n', "", "framing: the sources of one device must have the same framing"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            read_by(first, second)
+
+
+def test_an_emulator_of_a_block_of_its_own_has_the_nodes_that_a_source_reads(folder: Path) -> None:
+    (folder / "tags.toml").write_text(LINE.replace("DB6.DBW0", "ns=2;s=count"))
+    opcua = '[[source]]\nname = "NAME"\nconnector = "opcua"\nlayout = "LAYOUT"\nurl = "opc.tcp://127.0.0.1:1102/x"\n'
+    found = prepared(
+        folder,
+        opcua.replace("NAME", "tags").replace("LAYOUT", "tags.toml"),
+        opcua.replace("NAME", "cell").replace("LAYOUT", "cell.db") + 'nodes = "siemens"\n',
+        EMULATOR.replace('"s7"', '"opcua"'),
+        'layout = "cell.db"\n',
+    )
+    assert [dict(options) for _, options in found.emulated["plc"]] == [{"nodes": "siemens"}]
