@@ -348,7 +348,7 @@ class _History:
         at = int(time.searchsorted(moment_ns, "right"))
         if at + AROUND > len(time) and not final:
             return None
-        values = np.concatenate([rows.values[index] for rows in self._rows])
+        values = np.concatenate([rows.exact(index) for rows in self._rows])
         part = slice(max(0, at - AROUND), at + AROUND)
         pairs = zip(time[part].tolist(), values[part].tolist(), strict=True)
         return [(time_ns, None if value != value else value) for time_ns, value in pairs]  # noqa: PLR0124  NaN

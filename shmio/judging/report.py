@@ -15,7 +15,7 @@ from shmio.config import Declaration, Expectation
 from shmio.judging.pieces import Piece, head
 from shmio.judging.source import Signal, Trouble
 from shmio.judging.trace import Plot, compressed
-from shmio.judging.verdict import Outcome, Verdict, distance
+from shmio.judging.verdict import Outcome, Verdict, distance, number_text
 
 _Place = Callable[[float], float]
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 860, 130, 70, 20
@@ -215,7 +215,7 @@ def _moment(verdict: Verdict) -> str:
 
 
 def _number(value: float | None, otherwise: str = "unknown") -> str:
-    return otherwise if value is None else f"{value:.6g}"
+    return otherwise if value is None else number_text(value, 6)
 
 
 def _svg(report: Report, verdict: Verdict, drawn: Drawn) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from shmio.injection.exact import integers, split
+from shmio.injection.exact import Numbers, integers, split
 from shmio.judging.operators import Input
 from shmio.judging.pieces import FAR_NS, NO_TIMES, NOTHING, Piece, Times, Values
 from shmio.layout.model import Layout, Register
@@ -82,11 +83,18 @@ class Rows(NamedTuple):
         time: The moments from which the values hold, in ns, int64, shape (n,).
         values: The values, NaN where unknown, float64, shape (signals, n).
         end: The moment, in ns, at which the last values end, exclusive.
+        rests: What the values of a 64-bit integer lack to be exact, by the index of the signal.
     """
 
     time: Times
     values: Values
     end: int
+    rests: Mapping[int, Values] = MappingProxyType({})
+
+    def exact(self, index: int) -> Numbers:
+        """Return the values of a signal, with all digits of integers."""
+        values = self.values[index]
+        return integers(values, self.rests[index]) if index in self.rests else values
 
 
 class _Decoder:
@@ -265,7 +273,8 @@ class Source:
             self._begun = len(rows.time) > 0
         count = len(rows.time) if end_ns is None else len(rows.time) - 1
         shown = rows.values[: len(self.signals), :count]
-        self.rows = Rows(rows.time[:count], shown, rows.end if end_ns is None else end_ns)
+        rests = {index: rows.values[at, :count] for at, index in enumerate(self._wide, len(self.inputs))}
+        self.rows = Rows(rows.time[:count], shown, rows.end if end_ns is None else end_ns, rests)
         for index, node in enumerate(self.inputs):
             values = rows.values[index]
             if index in self._wide:

@@ -10,8 +10,16 @@ from math import isfinite
 import numpy as np
 
 from shmio.config import Expectation
+from shmio.injection.exact import LARGE
 from shmio.judging.operators import Node
 from shmio.judging.pieces import NOTHING, TINY, Alignment, Piece, Values, cut, head
+
+
+def number_text(number: float, digits: int) -> str:
+    """Return a number with all digits if it is whole and exact, else with the given number of digits."""
+    if isinstance(number, int) or (number.is_integer() and abs(number) < LARGE):
+        return str(int(number))
+    return f"{number:.{digits}g}"
 
 
 class Outcome(StrEnum):

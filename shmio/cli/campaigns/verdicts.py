@@ -12,7 +12,7 @@ import msgspec
 from shmio.cli.campaigns.reports import attempt
 from shmio.cli.common import give_up_if_broken, say, say_json
 from shmio.judging.judge import Judge
-from shmio.judging.verdict import Outcome, Verdict, distance
+from shmio.judging.verdict import Outcome, Verdict, distance, number_text
 
 UNDECIDED: Final = 3
 STATUSES: Final = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.INCONCLUSIVE: UNDECIDED}
@@ -92,7 +92,7 @@ def lines(verdict: Verdict, width: int = 0) -> list[str]:
     lines = [f"{verdict.outcome:<12}  {expectation.name:<{width}}{of}{robustness}{why}"]
     for name, pairs in verdict.around.items():
         values = "  ".join(
-            f"{time_ns / 1e9:.3f}: {'?' if value is None else f'{value:.9g}'}" for time_ns, value in pairs
+            f"{time_ns / 1e9:.3f}: {'?' if value is None else number_text(value, 9)}" for time_ns, value in pairs
         )
         lines.append(f"{'':<14}{name}  {values}")
     return lines

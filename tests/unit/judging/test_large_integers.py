@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import operator
 import random
+import re
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
@@ -11,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shmio.cli.campaigns.verdicts import as_table, lines
 from shmio.injection.condition import Memory
 from shmio.injection.language import Constant, Operation, Reference, Tree, parse_formula
 from shmio.injection.program import compile_condition
 from shmio.judging.judge import Judge
 from shmio.judging.pieces import FAR_NS, Piece
+from shmio.judging.report import Report, html, junit
 from shmio.judging.source import Frames
 from shmio.judging.verdict import Outcome
 from shmio.layout.model import Layout, Register
@@ -146,3 +150,15 @@ def test_a_value_that_a_reload_made_wide_is_never_wrong() -> None:
     (found,) = judge.verdicts
     assert found.outcome is Outcome.INCONCLUSIVE
     assert "too large to be compared exactly" in found.reason
+
+
+def test_a_failure_shows_all_digits_of_integers() -> None:
+    wrong = [(1 << 64) - 1, (1 << 53) + 1, (1 << 50) + 1, 1234567890123]
+    judged = verdict("always(u == 1 and r > 0)", *({"u": one, "r": one / 3} for one in wrong))
+    assert [value for _, value in judged.around["cell/u"]] == wrong[: len(judged.around["cell/u"])]
+    told = json.dumps(as_table(judged))
+    report = Report("", [], "", 0, 4 * S, [judged], [[]], [], [])
+    texts = "\n".join(lines(judged)), html(report, pytest.fail), junit(report).decode(), told
+    for one in wrong[: len(judged.around["cell/u"])]:
+        assert all(re.search(rf"\b{one}\b", text) for text in texts), (one, texts)
+    assert re.search(r"r  0\.000: 6\.14891469e\+18 ", texts[0])
