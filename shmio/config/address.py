@@ -74,7 +74,7 @@ _NUMERIC: Final = re.compile(r"[0-9]+(\.[0-9]+)+")
 
 
 def check_host(host: str) -> None:
-    """Refuse numbers with dots that are not an IPv4 address.
+    """Refuse numbers with dots that are not an IPv4 address, or that may be read as octal.
 
     Raises:
         ConfigError: The text is such. Whether a host has this name is not checked.
@@ -82,6 +82,10 @@ def check_host(host: str) -> None:
     """
     if _NUMERIC.fullmatch(host) and not _is_ipv4(host):
         raise ConfigError(f"{host!r} is not an IP address; write four numbers from 0 to 255, such as 192.168.0.10")
+    if _NUMERIC.fullmatch(host) and (plain := ".".join(str(int(part)) for part in host.split("."))) != host:
+        raise ConfigError(
+            f"{host!r} is not clear, because libraries read a number that begins with 0 as octal; write {plain}"
+        )
 
 
 def _is_ipv4(text: str) -> bool:

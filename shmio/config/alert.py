@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
-from shmio.config.address import Address
+from shmio.config.address import Address, check_host
 from shmio.config.model import Alert, Config
 from shmio.config.mqtt import check_publish_topic
 from shmio.errors import ConfigError
@@ -82,6 +82,10 @@ def parse_webhook(url: str) -> SplitResult:
         ) from None
     if parts.scheme not in ("http", "https") or not parts.hostname or port == 0 or len(url) > MAX_URL:
         raise ConfigError("webhook: expected a URL such as https://alerts.example/hooks/a50")
+    try:
+        check_host(parts.hostname)
+    except ConfigError as error:
+        raise ConfigError(f"webhook: {error}") from None
     if not url.isascii() or " " in url:
         raise ConfigError("webhook: percent-encode blanks and all characters that are not ASCII")
     if parts.username is not None or parts.password is not None:

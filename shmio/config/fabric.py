@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from typing import Final
 from urllib.parse import urlsplit
 
-from shmio.config.address import Address
+from shmio.config.address import Address, check_host
 from shmio.config.masking import mask_line
 from shmio.config.model import Config, Fabric, FabricAllow
 from shmio.errors import ConfigError
@@ -118,6 +118,10 @@ def server_address(key: str, url: str, credentials: str, others: str = "") -> Ad
         raise ConfigError(f"{key}: {shown!r} is not a NATS server; write nats://host:{PORT}, tls://host{others}")
     if parts.password or parts.username:
         raise ConfigError(f"{key}: a URL with a password is visible to others; name a file {credentials}")
+    try:
+        check_host(parts.hostname)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
     return Address(parts.hostname, port)
 
 

@@ -89,7 +89,7 @@ def _check_source(
 ) -> None:
     key = f"source[{index}]"
     options = _options(key, source, faults)
-    for name, host in _hosts(source.options):
+    for name, host in named_hosts(source.options):
         try:
             check_host(host)
         except ConfigError as error:
@@ -144,7 +144,7 @@ def _check_source(
         found.remote[source.name] = source.options["outputs"], source.options["inouts"]
 
 
-def _hosts(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def named_hosts(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield (key, host) for each host that a source's options name."""
     if isinstance(host := options.get("host"), str):
         yield "host", host

@@ -10,11 +10,13 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from shmio.config.address import check_host
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
 from shmio.connectors.browsing import Browsed, Offer, Wanted
 from shmio.errors import ConfigError
 from shmio.layout.importing.found import Found
+from shmio.plan.sources import named_hosts
 from shmio.wording import EXISTS, NOT_TOML, printable, unknown
 
 
@@ -48,6 +50,11 @@ def _connector(url: str, name: str | None, keys: list[str]) -> tuple[type[Connec
     if not issubclass(connector, Connector):
         raise ConfigError(f"connector {name} reads no device, so there is nothing to browse")
     given = connector.browse_options(url)
+    for _, host in named_hosts(given):
+        try:
+            check_host(host)
+        except ConfigError as error:
+            raise ConfigError(f"{url}: {error}") from None
     texts: dict[str, str] = {}
     for pair in keys:
         key, equals, value = pair.partition("=")

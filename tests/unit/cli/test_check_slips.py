@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -62,10 +63,23 @@ def test_wrong_addresses_are_faults(capsys: pytest.CaptureFixture[str]) -> None:
         for host in ("192.168.0.300", "10.0.0.1.2", "192.168.1"):
             _, told = check(capsys, SOURCE.format(connector=connector, more=line.format(host)))
             assert f"{key}: '{host}' is not an IP address; write four numbers from 0 to 255" in told
+        _, told = check(capsys, SOURCE.format(connector=connector, more=line.format("192.168.0.010")))
+        assert f"{key}: '192.168.0.010' is not clear" in told
+        assert "as octal; write 192.168.0.10 " in told
         _, told = check(capsys, SOURCE.format(connector=connector, more=line.format("192.168.0.30")))
         assert "is not an IP address" not in told
     _, told = check(capsys, SOURCE.format(connector="memory", more='[grpc]\nlisten = ["127.0.0.256:8089"]'))
     assert "'127.0.0.256' is not an IP address" in told
+    for more, key in (
+        ('[grpc]\nlisten = ["127.0.00.1:8089"]', "grpc.listen"),
+        ('[mqtt]\nbroker = "external"\nhost = "127.0.00.1"', "mqtt.host"),
+        ('[fabric]\nserver = "nats://127.0.00.1"\ncell = "a.b.c"', "fabric.server"),
+        ('[[alert]]\nname = "x"\nwhen = "cell/x > 5"\nwebhook = "http://127.0.00.1/"', "alert[0].webhook"),
+    ):
+        _, told = check(capsys, SOURCE.format(connector="memory", more=more))
+        assert re.search(rf"{re.escape(key)}\S*: '127\.0\.00\.1' is not clear.*write 127\.0\.0\.1\b", told), told
+    assert main(["browse", "opc.tcp://127.0.00.1:4840"]) == 1
+    assert "'127.0.00.1' is not clear" in capsys.readouterr().err
 
 
 def test_patterns_that_match_nothing_suggest_one_that_matches(capsys: pytest.CaptureFixture[str]) -> None:
