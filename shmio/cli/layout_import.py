@@ -73,11 +73,11 @@ def _import(options: argparse.Namespace) -> int:
         )
     except ImportingError as error:
         raise ImportingError(f"{file}: {error}") from None
-    for line in found.report():
+    for line in found.report(writable=options.writable):
         print(printable(line), file=sys.stderr)
     if not found.tags:
         raise ImportingError(f"{file}: the file has nothing to import")
-    table = found.to_toml(file.name, writable=options.writable)
+    table = found.to_toml(", ".join(Path(name).name for name in (file, *options.further)), writable=options.writable)
     if output is None:
         print(table, end="")
         return 0

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 from shmio.errors import Diagnostic
 from shmio.layout.model import (
@@ -47,7 +48,13 @@ _OPAQUE = (
     "the system type '{name}' is kept as {size} bytes without meaning, because its members are not public; "
     'if you know them, declare it as a PLC data type, TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
 )
+_NO_PLACE: Final = "left out, because their addresses are not known"
 _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, or --type-bytes "{name}=…" of shmio-layout'
+
+
+def is_of_left_out(warning: Diagnostic) -> bool:
+    """Return whether a warning names members that are left out, because their addresses are not known."""
+    return warning.message.startswith(_NO_PLACE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,9 +272,7 @@ class Placer:
         if lost:
             shown = ", ".join(repr(member.name) for member in lost[:MAX_NAMES])
             more = f" and {len(lost) - MAX_NAMES} more" if len(lost) > MAX_NAMES else ""
-            self._report.add(
-                lost[0].position.warning(f"left out, because their addresses are not known: {shown}{more}")
-            )
+            self._report.add(lost[0].position.warning(f"{_NO_PLACE}: {shown}{more}"))
         names = tuple(member.name.lower() for member in struct.members) if not complete else ()
         return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height, names=names, open=cause)
 
@@ -404,8 +409,9 @@ class Placer:
                 f'declare it as a PLC data type, TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE, to read it'
             )
         return (
-            f"shmio does not know the members of the system type {name.name}: {reason}; it leaves them out, and the "
-            "members after them, because their addresses depend on its size; declare it as a PLC data type, TYPE "
+            f"shmio does not know the members of the system type {name.name}: {reason}; it knows no "
+            "addresses of them, nor of the members after them, because these depend on its size; declare it as a PLC "
+            "data type, TYPE "
             f'"{name.name}" STRUCT … END_STRUCT; END_TYPE, or give only its size by {_SIZE.format(name=name.name)}, or '
             'read the block by OPC UA: connector = "opcua" with nodes = "siemens"'
         )
@@ -413,7 +419,7 @@ class Placer:
     def _unknown(self, name: Named) -> str:
         return (
             f"unknown type {name.name!r}; if it is a PLC data type or a function block, name its source (.udt, .scl, "
-            f".awl) as well; or give only its size by {_SIZE.format(name=name.name)}"
+            f".awl, .s7dcl) as well; or give only its size by {_SIZE.format(name=name.name)}"
         )
 
     def _refuse(self, position: Position, message: str) -> None:

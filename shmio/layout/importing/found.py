@@ -122,14 +122,17 @@ class Found:
         """Name and line of each item that was left out, by reason."""
         return self._skipped
 
-    def report(self) -> Iterator[str]:
-        """Yield lines for the user: the number of tags, the skipped items with reasons, the remarks."""
+    def report(self, *, writable: bool = True) -> Iterator[str]:
+        """Yield lines for the user: the number of tags, the skipped items with reasons, the remarks.
+
+        ``writable`` is that of :meth:`to_toml`.
+        """
         yield f"imported {counted(len(self.tags), 'tag')} from {self.kind}"
         for why, items in self._skipped.items():
             shown = ", ".join(_at(name, line) for name, line in items[:_NAMES_SHOWN])
             more = f" and {len(items) - _NAMES_SHOWN} more" if len(items) > _NAMES_SHOWN else ""
             yield f"skipped {len(items)}: {why}: {shown}{more}"
-        if self._read_only:
+        if self._read_only and writable:
             yield f"not writable: {counted(self._read_only, 'tag')}, because there are inputs at their addresses"
         yield from self.remarks[:_REMARKS_SHOWN]
         if len(self.remarks) > _REMARKS_SHOWN:

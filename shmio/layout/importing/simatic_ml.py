@@ -15,6 +15,7 @@ from shmio.layout.importing.plc_tag import CONSTANT, add_plc_tag
 from shmio.layout.importing.simatic_declarations import attribute, comment_of, unit_of
 from shmio.layout.importing.xml_tree import Node
 from shmio.layout.model import Layout, Register
+from shmio.layout.place import is_of_left_out
 from shmio.layout.s7.notation import in_block
 from shmio.layout.source.file import decode
 from shmio.layout.tags import TEXTS
@@ -26,6 +27,15 @@ _BLOCKS: Final = ("SW.Blocks.GlobalDB", "SW.Blocks.InstanceDB")
 _TABLES: Final = ("SW.Tags.PlcTagTable", "SW.ControllerTagTable")
 _TAGS: Final = ("SW.Tags.PlcTag", "SW.ControllerTag")
 """Tables and their tags; the second name is that of TIA Portal V13."""
+_REMEDY: Final = (
+    "declare the type as a PLC data type in a further file, or leave out all addresses by --by-name to read the block "
+    "by OPC UA"
+)
+_IN_SYSTEM_TYPE: Final = f"its address is unknown, because it is in a system type; {_REMEDY}"
+_AFTER_SYSTEM_TYPE: Final = (
+    f"its address is unknown, because it is in a system type of unknown size, or after one; {_REMEDY}; for what is "
+    "after it, its size by --type-bytes is enough"
+)
 _MAX_INITIAL: Final = 1000
 """Maximum number of elements of an array whose initial values are imported."""
 
@@ -120,10 +130,12 @@ def _add_blocks(
             if placed is not None and not layout.optimized:
                 addresses, more = _placed(placed, name, type_bytes)
                 places = {(one.file, one.line) for one in more}
-                warnings = [*(one for one in warnings if (one.file, one.line) not in places), *more]
+                # The report itself says which members lack only an address, and whether they are left out.
+                warnings = [one for one in warnings if is_of_left_out(one) or (one.file, one.line) not in places]
+                warnings += (one for one in more if not is_of_left_out(one))
         except LayoutError as error:
             faults = error.diagnostics or (str(error),)
-            found.skip(name, f"the data block cannot be placed: {faults[0]}", node.line)
+            found.skip(name, f"the data block cannot be placed: {faults[0]}")  # which has the line
             continue
         shown = [str(one) for one in warnings if not is_of_access(one)]
         found.remarks += [text for text in dict.fromkeys(shown) if text not in found.remarks]
@@ -156,18 +168,14 @@ def _add_block(
             f"{name} has optimized access: its values have no addresses, and the column is empty; read it by OPC UA "
             "with nodes = \"siemens\", or switch off 'Optimized block access'"
         )
+    opaque = tuple(f"{path.removesuffix('bytes')}" for path in addresses if path not in layout.by_path)
     addresses = {path: at for path, at in addresses.items() if number is not None and path in layout.by_path}
     for register in layout.registers:
         at = addresses.get(register.path)
         names = prefix + tuple(map(decode_segment, register.path.split("/")))
         if at is None and addresses:
-            found.skip(
-                "/".join(names),
-                "its address is unknown, because it is in a system type, or after one of unknown size; declare the "
-                "type as a PLC data type in a further file, or leave out all addresses by --by-name to read the block "
-                "by OPC UA; for what is after it, its size by --type-bytes is enough",
-                line,
-            )
+            inside = register.path.startswith(opaque)
+            found.skip("/".join(names), _IN_SYSTEM_TYPE if inside else _AFTER_SYSTEM_TYPE, line)
             continue
         address = ""
         if at is not None and number is not None:

@@ -163,3 +163,14 @@ def test_invalid_type_size_is_wrong_usage(size: str, capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit):
         main(["a.db", "--type-bytes", size])
     assert "expected a type and its bytes" in capsys.readouterr().err
+
+
+def test_an_imported_table_names_all_of_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    block = '<Document><SW.Blocks.GlobalDB><AttributeList><Interface><Sections><Section Name="Static"><Member Name="a" '
+    block += 'Datatype="Int" /></Section></Sections></Interface><Name>{0}</Name><Number>{1}</Number></AttributeList>'
+    block += "</SW.Blocks.GlobalDB></Document>"
+    files = [tmp_path / "one.xml", tmp_path / "two.xml"]
+    for number, file in enumerate(files, 1):
+        file.write_text(block.format(file.stem, number))
+    assert main(["import", *map(str, files)]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("imported from one.xml, two.xml")

@@ -256,6 +256,7 @@ def test_system_types_cost_only_what_cannot_be_placed() -> None:
         found = imported(name)
         assert list(places(found)) == timers, name
         assert {address for _, address in places(found).values()} == {""}
+        assert not any("left out" in line or "leaves" in line for line in found.report())  # it has all members
         layout = compile_sources([Source("any.toml", found.to_toml("x", writable=False).encode())]).layouts[0]
         assert siemens.node_address(layout, layout.registers[0]).identifier == '"Timers"."t"."PT"'
     sized = imported("s7/ml_ton_member.xml", type_bytes={"TON_TIME": 16})
@@ -292,7 +293,7 @@ def test_an_unknown_system_type_costs_the_members_whose_addresses_depend_on_it()
         "x.db:2:52: warning: left out, because their addresses are not known: 'b'",
         "x.db:3:53: warning: left out, because their addresses are not known: 'y', 'e'",
     ]
-    assert re.search("leaves them out, and the members after them.*type_bytes.*siemens", warning.message)
+    assert re.search("no addresses of them, nor of the members after them.*type_bytes.*siemens", warning.message)
     sized = program.compile(type_bytes={"TON_TIME": 16})
     assert offsets(sized.layouts[0]) | {"y": "22"} == offsets(sized.layouts[0])
     named = program.compile(by_name=True)
@@ -602,6 +603,7 @@ def test_the_remedies_of_a_skipped_tag_work() -> None:
         assert [name for name, _ in skipped] == [f"{one}/{name}" for one in members for name in ("PT", "ET", "IN", "Q")]
         assert "PLC data type" in why
         assert "--by-name" in why
+        assert "--type-bytes" not in why  # no size is missing
     assert {*import_tags(data, by_name=True).tags} == {*declared.tags, "i/PT", "i/ET", "i/IN", "i/Q"}
 
 
@@ -652,3 +654,12 @@ def test_tags_of_tia_portal_v13() -> None:
     for text in (data, data.replace(b"SW.Controller", b"SW.Tags.Plc")):
         assert places(import_tags(text)) == {"Guard": ("Bool", "%I0.3")}
         assert "shmio-layout import" in foreign("x.xml", text)
+
+
+def test_inputs_that_cannot_be_written_are_reported_only_if_others_become_writable() -> None:
+    keys = {"ExternalWritable": "true", "DataTypeName": "Bool", "LogicalAddress": "%I0.0", "Name": "i"}
+    attributes = "".join(f"<{key}>{value}</{key}>" for key, value in keys.items())
+    tag = f"<SW.Tags.PlcTag><AttributeList>{attributes}</AttributeList></SW.Tags.PlcTag>"
+    found = import_tags(f"<Document><SW.Tags.PlcTagTable>{tag}</SW.Tags.PlcTagTable></Document>".encode())
+    told = "not writable: 1 tag, because there are inputs at their addresses"
+    assert [told in found.report(writable=writable) for writable in (True, False)] == [True, False]
