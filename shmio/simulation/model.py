@@ -121,6 +121,11 @@ class Declaration:
             ValueRangeError: The type is invalid.
 
         """
+        if not isinstance(self.type, str | Mapping):
+            raise ModelError(
+                f"type: expected a type such as 'LREAL', or a dict with the types of the members, found {self.type!r}; "
+                "the initial value comes after it, as in Parameter('LREAL', 1.0)"
+            )
         if self.limits is not None:
             self._check_limits(self.limits)
         if self.members is None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 
@@ -86,6 +87,11 @@ def test_a_subclass_has_the_registers_of_the_class_above() -> None:
         (lambda: Input({"a": "INT"}, {"b": 1}), "speed: initial: expected a dict with some of a, found {'b': 1}"),
         (lambda: InOut("JointTrajectory[6]"), "speed: expected JointTrajectory[joints, points] with at most 64 joints"),
         (lambda: Parameter("RAEL"), "speed: unknown type 'RAEL'"),
+        (
+            lambda: Parameter(cast("Any", 1.0)),
+            "speed: type: expected a type such as 'LREAL', or a dict with the types of the members, found 1.0; ",
+        ),
+        (lambda: InOut(cast("Any", None)), "speed: type: expected a type such as 'LREAL'"),
         (lambda: Input("RAEL", limits=(0, 1)), "speed: unknown type 'RAEL'"),
         (lambda: Output("INT", limits=(0, 1)), "speed: limits: an output has no limits"),
         (lambda: Input("BOOL", limits=(0, 1)), "speed: limits: only a number or an array of numbers"),
