@@ -9,6 +9,7 @@ from pathlib import Path
 
 from shmio.cli.common import run
 from shmio.cli.layout_options import add_encoding, add_type_bytes, read_source
+from shmio.files import create_file
 from shmio.layout.foreign import FORMATS
 from shmio.layout.importing.found import ImportingError
 from shmio.layout.importing.importer import MAX_BYTES, import_tags
@@ -82,8 +83,7 @@ def _import(options: argparse.Namespace) -> int:
         print(table, end="")
         return 0
     try:
-        with output.open("x", encoding="utf-8") as stream:
-            stream.write(table)
+        create_file(output, table.encode())
     except FileExistsError:
         raise ImportingError(f"{output}: {EXISTS}") from None
     return 0

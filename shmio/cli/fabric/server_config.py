@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import secrets
 from collections.abc import Iterator, Sequence
@@ -21,7 +20,7 @@ from shmio.errors import ConfigError
 from shmio.fabric.connection import INSTALL, public_key
 from shmio.fabric.names import CellName
 from shmio.fabric.server_config import ROUTE_PORTS, Kind, ServerSettings, User, server_configuration
-from shmio.files import replace_file
+from shmio.files import create_file, replace_file
 from shmio.libraries import library
 from shmio.wording import plain_text, printable
 
@@ -135,11 +134,9 @@ def _make_seed(file: Path) -> bool:
     nkeys = library("nkeys", INSTALL)
     file.parent.mkdir(mode=0o700, exist_ok=True)
     try:
-        fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        create_file(file, nkeys.encode_seed(secrets.token_bytes(32), nkeys.PREFIX_BYTE_USER) + b"\n", private=True)
     except FileExistsError:
         return False
-    with open(fd, "wb") as stream:  # noqa: PTH123  a descriptor
-        stream.write(nkeys.encode_seed(secrets.token_bytes(32), nkeys.PREFIX_BYTE_USER) + b"\n")
     return True
 
 

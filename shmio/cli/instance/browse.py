@@ -15,6 +15,7 @@ from shmio.connectors import registry
 from shmio.connectors.base import Connector
 from shmio.connectors.browsing import Browsed, Offer, Wanted
 from shmio.errors import ConfigError
+from shmio.files import create_file
 from shmio.layout.importing.found import Found
 from shmio.plan.sources import named_hosts
 from shmio.wording import EXISTS, NOT_TOML, printable, unknown
@@ -93,8 +94,7 @@ def _write(arguments: argparse.Namespace, found: Browsed) -> None:
     if not table.tags:
         raise ConfigError(f"{arguments.url}: the device offers nothing that a tag table can hold")
     try:
-        with arguments.output.open("x", encoding="utf-8") as stream:
-            stream.write(table.to_toml(arguments.url, writable=arguments.writable))
+        create_file(arguments.output, table.to_toml(arguments.url, writable=arguments.writable).encode())
     except FileExistsError:
         raise ConfigError(f"{arguments.output}: {EXISTS}") from None
 

@@ -12,7 +12,7 @@ import re
 import sys
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from importlib import resources
 from itertools import chain, count, islice
@@ -25,6 +25,7 @@ from shmio.config.read import SECTION_PROCESSES, read_properties, read_tables
 from shmio.config.web import check_library
 from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError
+from shmio.files import create_file
 from shmio.layout.compiler import SUFFIXES as SOURCES
 from shmio.layout.compiler import Program
 from shmio.layout.foreign import foreign
@@ -145,10 +146,12 @@ def _write(files: dict[Path, str]) -> None:
         kept = path.suffix == ".db" or path.name in EXAMPLE[1:]
         if not (path.is_file() and kept and path.read_bytes() == content.encode()):
             _refuse_present(path)
-    for path, content in files.items():
-        if not path.exists():
-            with path.open("x", encoding="utf-8") as stream:
-                stream.write(content)
+    with ExitStack() as undone:
+        for path, content in files.items():
+            if not path.exists():
+                create_file(path, content.encode())
+                undone.callback(path.unlink, missing_ok=True)
+        undone.pop_all()
 
 
 class NewConfig(NamedTuple):

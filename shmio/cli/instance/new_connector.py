@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shutil
 from importlib import resources
 from pathlib import Path
 from typing import Final
 
 from shmio.connectors.registry import BUILT_IN, names
 from shmio.errors import ConfigError
+from shmio.files import create_file
 from shmio.wording import printable
 
 MAX_LENGTH: Final = 40
@@ -41,10 +43,15 @@ def new_connector(arguments: argparse.Namespace) -> int:
         raise ConfigError(
             f"{folder} exists already and was not changed; choose another name by -o FOLDER, or remove the folder"
         )
-    for path, content in package(name).items():
-        file = folder / path
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(content, encoding="utf-8")
+    files = {folder / path: content.encode() for path, content in package(name).items()}
+    try:
+        for file, content in files.items():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            create_file(file, content)
+    except OSError:
+        shutil.rmtree(folder, ignore_errors=True)  # else another attempt would refuse the folder
+        raise
+    for file in files:
         print(printable(f"wrote {file}"))
     print(printable(f"next: cd {folder}, then pip install -e '.[test]', then pytest; README.md says what to replace"))
     return 0
