@@ -41,7 +41,7 @@ from snap7.type import SrvArea
 from shmio.config.address import Address
 from shmio.emulators.s7_profiles import PROFILES, Delays, Kind, Profile
 from shmio.errors import ConfigError, EndpointError, ShmioError
-from shmio.wording import cannot_listen, unknown
+from shmio.wording import brief, cannot_listen, did_you_mean, listed, near
 
 MAX_JOBS = 32
 MAX_PDU_SIZE = 960
@@ -174,7 +174,10 @@ class ServerOptions:
         """
         found = PROFILES.get(profile)
         if found is None:
-            raise ConfigError(f"profile: {unknown('profile', profile, PROFILES)}")
+            meant = did_you_mean(near(profile, PROFILES))
+            raise ConfigError(
+                f"profile: unknown profile {brief(profile)}; {f'{meant} ' * bool(meant)}{listed(PROFILES)}"
+            )
         return cls(found.pdu_size, found.jobs, profile=found)
 
 

@@ -72,7 +72,7 @@ def canonical(name: str) -> str:
     try:
         return _BY_CODEC[codecs.lookup(wanted).name]
     except (LookupError, ValueError, UnicodeError):
-        raise ValueError(unknown("encoding", name, NAMES)) from None
+        raise ValueError(unknown("encoding", name, dict.fromkeys((*NAMES, *_WIDER)))) from None
 
 
 def codec(name: str) -> str:

@@ -28,9 +28,9 @@ from shmio.layout.overlay import overlay_register
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.s7.address import is_address
 from shmio.layout.spelling import block_path
-from shmio.layout.tags import Lines, parse_type, read_sheet, read_toml
+from shmio.layout.tags import Lines, parse_type, read_sheet, read_toml, unknown_column
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
-from shmio.wording import near, printable, unknown
+from shmio.wording import printable, unknown
 
 _NEEDED: Final = ("path", "address")
 
@@ -164,8 +164,7 @@ def _entry(given: object) -> _Entry:
     known = _Entry.__struct_fields__
     if isinstance(given, dict) and (others := given.keys() - set(known)):
         other = min(others)
-        hint = "" if near(other, known) else "; write a path with a dot in quotes"
-        raise ValueError(f"{unknown('key', other, known)}{hint}")
+        raise ValueError(unknown_column(other, given, known, "; write a path with a dot in quotes"))
     try:
         return msgspec.convert(given, _Entry)
     except msgspec.ValidationError as error:

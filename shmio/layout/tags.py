@@ -80,6 +80,10 @@ _Scalar = bool | int | float | str
 _Read = TypeVar("_Read")
 
 
+OF_SOURCES: Final = ("quality", "time")
+"""Keys that a register cannot have, but a source of MQTT."""
+
+
 class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     type: str
     initial: _Scalar | list[_Scalar] | None = None
@@ -371,15 +375,21 @@ def _deadband(tag: _Tag, element: ElementType) -> float:
     return tag.deadband
 
 
+def unknown_column(name: str, entry: Mapping[str, object], known: Sequence[str], hint: str) -> str:
+    """Return the message about an unknown key of a register; ``hint`` is its end if no known key is similar."""
+    if name in OF_SOURCES and "type" in entry:  # else it may be a part of a path
+        return f'unknown key {name!r}; {name} is a key of a [[source]] with connector = "mqtt": write it there'
+    return f"{unknown('key', name, known)}{'' if near(name, known) else hint}"
+
+
 def _tag(key: str, given: object) -> _Tag:
     """Read the entry of one register; raise ValueError if it is wrong."""
     if isinstance(given, str):
         return _Tag(given)
     if isinstance(given, dict) and (others := given.keys() - set(_Tag.__struct_fields__)):
         other = min(others)
-        known = _Tag.__struct_fields__
-        quoted = f'; write a path with a dot in quotes, "{shorten(printable(f"{key}.{other}"))}"'
-        raise ValueError(f"{unknown('key', other, known)}{'' if near(other, known) else quoted}")
+        hint = f'; write a path with a dot in quotes, "{shorten(printable(f"{key}.{other}"))}"'
+        raise ValueError(unknown_column(other, given, _Tag.__struct_fields__, hint))
     try:
         return msgspec.convert(given, _Tag)
     except msgspec.ValidationError as error:

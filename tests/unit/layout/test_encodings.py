@@ -55,6 +55,8 @@ def test_names_of_encodings() -> None:
     for wrong in ("", "utf-16", "base64", "rot13", "idna", "windows-1259", "a\0b"):
         with pytest.raises(ValueError, match="unknown encoding"):
             canonical(wrong)
+    with pytest.raises(ValueError, match="did you mean 'gb2312'"):
+        canonical("gb2313")
 
 
 @given(st.sampled_from([*NAMES, "utf-16-be", "utf-16-le"]), st.binary(max_size=16))

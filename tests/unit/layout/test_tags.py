@@ -113,6 +113,8 @@ WRONG = {
     "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: unknown key 'b'; valid: type, "
     "initial, comment, unit, address, scale, deadband, writable, word_order, byte_order; write a path with a dot in "
     'quotes, "a.b"',
+    "[registers]\na = { type = 'INT', quality = 'q' }": "2:1: error: a: unknown key 'quality'; quality is a key of a",
+    "[registers]\na.time = 'INT'": 'write a path with a dot in quotes, "a.time"',
     "[registers]\na/b = 'INT'": "write a path in quotes",
     "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: unknown type",
 }

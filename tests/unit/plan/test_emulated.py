@@ -97,7 +97,7 @@ def test_a_program_runs_on_the_only_table(folder: Path) -> None:
             "layout: this key is needed: program wave runs on one of press, line",
         ),
         ((source("line", "line.toml"), "a50"), "program a50: "),
-        ((source("line", "line.toml"), "profile"), r"emulator\[0\].*profile: unknown profile 's7-30'.*'s7-300'"),
+        ((source("line", "line.toml"), "profile"), r"\[0\].*unknown profile 's7-30'.*'s7-300'.*valid: .*im151-8"),
         ((source("cell", "cell.db", "dbNumber = 7\n"), "table"), "dbNumber: leave out this key, because each address"),
         (
             (source("cell", "cell.db", "dbNumber = 6\n"), source("line", "long.toml")),
