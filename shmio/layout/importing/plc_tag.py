@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from shmio.layout.importing.found import Found, of_s7
+from shmio.layout.model import element_type
 from shmio.layout.s7.notation import value_type
 
 NO_ADDRESS: Final = "the tag has no address"
@@ -21,6 +22,8 @@ def add_plc_tag(
         found.skip(name, NO_ADDRESS, line)
     elif kind.startswith('"'):
         found.skip(name, "a PLC data type; name its members in the table", line)
+    elif kind.replace(" ", "").isidentifier() and element_type(value_type(kind)) is None:  # as "UDT 5" in STEP 7
+        found.skip(name, f"unknown type {kind!r}; if it is a PLC data type, name its members in the table", line)
     else:
         columns = {"address": address, "comment": comment, "writable": writable}
         found.add((name,), value_type(kind), columns, line, of_s7)

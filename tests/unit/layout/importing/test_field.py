@@ -663,3 +663,10 @@ def test_inputs_that_cannot_be_written_are_reported_only_if_others_become_writab
     found = import_tags(f"<Document><SW.Tags.PlcTagTable>{tag}</SW.Tags.PlcTagTable></Document>".encode())
     told = "not writable: 1 tag, because there are inputs at their addresses"
     assert [told in found.report(writable=writable) for writable in (True, False)] == [True, False]
+
+
+def test_types_that_only_the_project_knows_are_named_as_such_in_tag_lists() -> None:
+    for kind in ("UDT 5", "Widget", "Point"):
+        found = import_tags(f'"a","M 10.0","{kind}",""\n"b","M 12.0","BOOL",""\n'.encode())
+        assert [*found.tags] == ["b"]
+        assert [*found.skipped] == [f"unknown type '{kind}'; if it is a PLC data type, name its members in the table"]
