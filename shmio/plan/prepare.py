@@ -238,7 +238,9 @@ def peer(source: Source) -> str:
     if url := source.options.get("url"):
         return str(url)
     host, port = source.options.get("host"), source.options.get("port")
-    return str(Address(host, port)) if host and port else str(host or "")
+    if isinstance(host, str) and host and isinstance(port, int):  # the connector's own check may come later
+        return str(Address(host, port))
+    return str(host or "")
 
 
 def _check_condition(when: str, layouts: dict[str, Layout]) -> None:

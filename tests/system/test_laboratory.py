@@ -143,12 +143,12 @@ def in_laboratory(folder: Path, recording: Path, seed: int) -> LiveRun:
 def contents(file: Path) -> list[Frame | Event]:
     """Return all that a recording has, without what can differ between two runs of an instance.
 
-    These are the host's clock, and the numbers of commands, which begin with it.
+    These are the host's clock, the numbers of commands, which begin with it, and their senders, which are processes.
     """
     with open_dump(file) as dump:
         frames = [entry.item._replace(publish_ns=0) for source in dump.sources for entry in dump.frames(source)]
         events = [
-            entry.item._replace(publish_ns=0, command=0, injection=0)
+            entry.item._replace(publish_ns=0, command=0, injection=0, by="")
             for source in dump.sources
             for entry in dump.events(source)
         ]

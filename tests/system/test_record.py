@@ -141,5 +141,5 @@ def test_notes_and_process_deaths_are_recorded(make_cell: Callable[..., Cell]) -
     printed = cell.output("shmio-dump", "cat", str(file))
     assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
     assert "process recorder is, pid" in printed
-    notes = re.findall(r": noted by program \d: (.*)", printed)
+    notes = re.findall(r": noted by local: uid \d+ \(pid \d+ shmio-dump\): (.*)", printed)
     assert notes == ["Greifer getauscht", rf"\x1b[2J{'ö' * 126}"], "complete, with control characters escaped"
