@@ -27,27 +27,8 @@ FRAME = Frame(
     bytes(range(200)) * 11, bytes(2200),
 )  # fmt: skip
 EVENT = Event(
-    4,
-    4,
-    7,
-    70,
-    1_000,
-    900,
-    1_700_000_000,
-    3,
-    Quality.GOOD,
-    5,
-    99,
-    1,
-    2,
-    8,
-    0,
-    2,
-    b"\1\2",
-    "",
-    12,
-    "web: anonymous (::1)",
-)
+    4, 4, 7, 70, 1_000, 900, 1_700_000_000, 3, Quality.GOOD, 5, 99, 1, 2, 8, 0, 2, b"\1\2", "", 12, "web: x (::1)"
+)  # fmt: skip
 GAP = Gap("cell", 1, "frames", 3, 6, 4, Reason.OVERTAKEN)
 HEADER = Header(3, 1 << 60, 12, b"abcdefgh", 1_700_000_000_000, 5, -1_600_000_000_000)
 
