@@ -110,7 +110,8 @@ def test_two_signals_at_once_leave_nothing(
     if state == "running":
         cell.wait_state("running")
     else:
-        until(lambda: cell.instance in instances() and cell.of("grpc").pid is not None)
+        started = lambda: {one.name for one in cell.status().processes if one.pid}  # noqa: E731
+        until(lambda: cell.instance in instances() and "grpc" in started())
     pids = [pid for pid in cell.pids().values() if pid is not None]
     with Segment.open(cell.instance) as segment:
         own = Path(segment.header.control)
