@@ -110,8 +110,11 @@ def test_two_signals_at_once_leave_nothing(
     if state == "running":
         cell.wait_state("running")
     else:
-        started = lambda: {one.name for one in cell.status().processes if one.pid}  # noqa: E731
-        until(lambda: cell.instance in instances() and "grpc" in started())
+        until(
+            lambda: (
+                cell.instance in instances() and any(one.pid and one.name == "grpc" for one in cell.status().processes)
+            )
+        )
     pids = [pid for pid in cell.pids().values() if pid is not None]
     with Segment.open(cell.instance) as segment:
         own = Path(segment.header.control)
