@@ -54,7 +54,7 @@ class Found(msgspec.Struct, frozen=True):
     text: bool = False
     """True if ``value`` is the whole payload, as text."""
     reason: str = ""
-    """What the code does not say, for the log."""
+    """A detail for the log, which the code cannot express."""
 
 
 class Origin(ABC):

@@ -29,7 +29,7 @@ class Inbox:
         """Create a buffer for ``frames`` frames of at most ``longest`` bytes."""
         self._data = memoryview(bytearray())
         self._start = self._end = 0  # range of the bytes received, but not yet taken
-        self._parts = bytearray()  # of a message whose last TPDU has not come yet
+        self._parts = bytearray()  # parts of a message that still lacks its last TPDU
         self.reserve(frames, longest)
 
     def reserve(self, frames: int, longest: int) -> None:
