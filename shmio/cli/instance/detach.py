@@ -66,7 +66,7 @@ StartMessage = Configured | Started | Failed
 def detach(arguments: argparse.Namespace) -> int:
     """Start the instance in another process, and return once it runs."""
     file, mode = config_file(arguments), arguments.mode
-    with exit_on_signals():  # otherwise, the instance would outlive the command that starts it
+    with exit_on_signals():  # if the wait is interrupted, the instance ends, too
         log_file, started = start(file, mode, replay_words(replay_keys(arguments)))
     for line in started.history:
         say(line)
